@@ -1,0 +1,186 @@
+r"""Reduce: the equations of motion on a wire as one scalar ODE and four contact forces.
+
+With `x = dz/ds`, `x' = d2z/ds2`, `v = ds/dt`, `a = dv/dt` the motion is `z_dot = x v`, `z_ddot = x a + x' v^2`, and at each
+`s` one 5x5 linear system gives everything (the paper's eqs. 1-4 and 12-16 in one line):
+
+    [ M x , -(G_n - Xi U G_t)^T ] [a ; c_n] = E tau + g - M x' v^2 - B x v - D sgn(x v)
+
+Its answer is linear in `(1, v^2, v, tau1, tau2)`. For forward travel the coefficients are functions of `s` alone, here
+tabulated as one polynomial a panel of the wire.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from wholearm_jax.contacts import normal_curvature, normal_rows, slip_rows
+from wholearm_jax.status import Status
+from wholearm_jax.system import System, configuration_unit
+from wholearm_jax.wire import Wire, chebyshev
+
+TERMS = 5  # 1, v^2, v, tau1, tau2
+
+
+class Table(eqx.Module):
+    """A reduced wire: polynomials in the panel coordinate `xi` in [-1, 1], lowest power first, SI units.
+
+    `acceleration[p, k]` are the coefficients of `a = ds^2/dt^2` in `(1, v^2, v, tau1, tau2)`, `backward[p, k]` those in
+    `(1, tau1, tau2)` for travel the other way at rest, `force[p, k, i]` those of contact `i`'s `c_n` [N],
+    `configuration[p, k]` those of `z`, `velocity[p, k]` those of `dz/ds`. `tension[piece, i]` is `c_t / c_n` (eq. 3).
+    `error` is the largest interpolation error, relative to each function's own size; `condition` the largest
+    condition number of the 5x5 matrix, at `condition_s`.
+    """
+
+    breaks: Float[Array, "pieces_1"]
+    count: Int[Array, ""]
+    factor: Float[Array, "pieces"]
+    first: Int[Array, "pieces"]
+    panels: Int[Array, "pieces"]
+    acceleration: Float[Array, "panels powers 5"]
+    backward: Float[Array, "panels powers 3"]
+    force: Float[Array, "panels powers contacts 5"]
+    configuration: Float[Array, "panels powers 5"]
+    velocity: Float[Array, "panels powers 5"]
+    tension: Float[Array, "pieces contacts"]
+    torque_limit: Float[Array, "2"]
+    error: Float[Array, ""]
+    condition: Float[Array, ""]
+    condition_s: Float[Array, ""]
+    status: Int[Array, ""]
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """The wire's extent in `s`."""
+        return self.breaks[-1] - self.breaks[0]
+
+
+def balance(system: System, z, x, bend, slip_sign, joint_sign):
+    """The 5x5 matrix and its right-hand sides for `(1, v^2, v, tau1, tau2)` at one place of the wire (object units).
+
+    `x = dz/ds`, `bend = x'`; `slip_sign` is Xi, `joint_sign` the signs of the joint speeds.
+    """
+    friction = (system.contacts.friction * slip_sign)[:, None] * slip_rows(system.contacts, z)
+    wrench = (normal_rows(system.contacts, z) - friction).T
+    matrix = jnp.concatenate([(system.inertia * x)[:, None], -wrench], axis=1)
+    none, weight = jnp.zeros(3, z.dtype), system.inertia[0] * system.gravity
+    dry = jnp.concatenate([weight, jnp.zeros(1, z.dtype), -system.dry * joint_sign])
+    viscous = jnp.concatenate([none, -system.viscous * x[3:]])
+    torque = jnp.eye(5, dtype=z.dtype)[3:]
+    return matrix, jnp.stack([dry, -system.inertia * bend, viscous, *torque], axis=1)
+
+
+def along_wire(system: System, z, u):
+    """`x = dz/ds` and `x' = d2z/ds2` in the chart with direction `u`: `G_n x = 0`, `u.x = 1`, `G_n x' = -x^T H x`."""
+    rows = jnp.concatenate([normal_rows(system.contacts, z), u[None]])
+    unit = jnp.zeros(5, z.dtype).at[4].set(1.0)
+    x = jnp.linalg.solve(rows, unit)
+    bend = jnp.linalg.solve(rows, jnp.concatenate([-normal_curvature(system.contacts, z, x), jnp.zeros(1, z.dtype)]))
+    return x, bend
+
+
+def reduce_wire(system: System, wire: Wire) -> Table:
+    """Solve the 5x5 system at every node of a wire and tabulate."""
+    chart = wire.chart[wire.owner]
+    xi, turn = wire.slip_sign[wire.owner], wire.joint_sign[wire.owner]
+
+    def node(z, u, slip_sign, joint_sign):
+        x, bend = along_wire(system, z, u)
+        matrix, right = balance(system, z, x, bend, slip_sign, joint_sign)
+        smooth, _ = balance(system, z, x, bend, 0 * slip_sign, joint_sign)
+        back, resting = balance(system, z, x, bend, -slip_sign, -joint_sign)
+        inverse = jnp.linalg.inv(matrix)
+        solution = inverse @ right
+        behind = jnp.linalg.solve(back, resting[:, jnp.array([0, 3, 4])])
+        # Friction may turn the determinant's sign only by passing through a singular matrix.
+        upright = jnp.linalg.det(matrix) * jnp.linalg.det(smooth)
+        condition = jnp.abs(matrix).sum(0).max() * jnp.abs(inverse).sum(0).max()
+        return x, solution[0], solution[1:], behind[0], condition, upright
+
+    over_nodes = jax.vmap(node, (0, None, None, None))
+    x, ahead, force, behind, condition, upright = jax.vmap(over_nodes)(wire.nodes, chart, xi, turn)
+
+    torque, newtons = system.torque_unit, system.force_unit
+    per_term = jnp.stack([jnp.ones_like(torque), jnp.ones_like(torque), jnp.ones_like(torque), 1 / torque, 1 / torque])
+    unit = configuration_unit(system.length)
+    columns = {
+        "acceleration": ahead * per_term,
+        "backward": behind * per_term[jnp.array([0, 3, 4])],
+        "force": force * per_term * newtons,
+        "configuration": wire.nodes * unit,
+        "velocity": x * unit,
+    }
+    fitted = {name: jnp.einsum("kn,pn...->pk...", _TO_POWERS[wire.nodes.shape[1]], c) for name, c in columns.items()}
+    error = jnp.stack([_tail(c) for c in columns.values()]).max()
+    worst = condition.max()
+    eps = jnp.finfo(x.dtype).eps
+    broken = (worst > 0.01 / eps) | ~(upright.min() > 0)
+    panel, at = jnp.unravel_index(jnp.argmax(jnp.where(upright > 0, condition, jnp.inf)), condition.shape)
+    return Table(
+        breaks=wire.breaks,
+        count=wire.count,
+        factor=wire.factor,
+        first=wire.first,
+        panels=wire.panels,
+        **fitted,
+        tension=-system.contacts.friction * wire.slip_sign,
+        torque_limit=system.torque_limit,
+        error=error,
+        condition=worst,
+        condition_s=_place(wire, panel, at),
+        status=jnp.where(wire.status > 0, wire.status, jnp.where(broken, int(Status.SINGULAR), 0)),
+    )
+
+
+def powers(table: Table, piece: Int[Array, ""], s: Float[Array, ""]) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """The panel of `piece` that serves `s` (the nearest one beyond the piece's ends) and the panel coordinate."""
+    low, high = table.breaks[piece], table.breaks[piece + 1]
+    width = jnp.where(high > low, high - low, 1.0)
+    share = (s - low) / width * table.panels[piece]
+    local = jnp.clip(jnp.floor(jax.lax.stop_gradient(share)), 0, jnp.maximum(table.panels[piece] - 1, 0))
+    return table.first[piece] + local.astype(int), 2 * (share - local) - 1
+
+
+def horner(coefficients: Float[Array, "powers ..."], xi: Float[Array, ""]) -> Float[Array, "..."]:
+    """The value of a polynomial, lowest power first."""
+    value = coefficients[-1]
+    for row in range(coefficients.shape[0] - 2, -1, -1):
+        value = coefficients[row] + xi * value
+    return value
+
+
+def _place(wire, panel, at):
+    piece = wire.owner[panel]
+    local = panel - wire.first[piece] + (jnp.asarray(chebyshev(wire.nodes.shape[1]))[at] + 1) / 2
+    return wire.breaks[piece] + (wire.breaks[piece + 1] - wire.breaks[piece]) * local / wire.panels[piece]
+
+
+def _tail(values):
+    """The last two Chebyshev coefficients of every panel against the largest value of each function."""
+    coefficients = jnp.einsum("kn,pn...->pk...", _TO_CHEBYSHEV[values.shape[1]], jax.lax.stop_gradient(values))
+    tail = jnp.abs(coefficients[:, -2:]).sum(1).max(0)
+    size = jnp.abs(values).max((0, 1))
+    return (tail / jnp.maximum(size, 1e-9 * size.max() + 1e-300)).max()
+
+
+def _transforms(nodes):
+    x = chebyshev(nodes)
+    to_chebyshev = np.linalg.inv(np.polynomial.chebyshev.chebvander(x, nodes - 1))
+    series = [np.polynomial.chebyshev.cheb2poly(np.eye(nodes)[k]) for k in range(nodes)]
+    to_powers = sum(np.outer(np.pad(p, (0, nodes - len(p))), to_chebyshev[k]) for k, p in enumerate(series))
+    return to_chebyshev, to_powers
+
+
+class _Cache(dict):
+    """Constant matrices by number of nodes."""
+
+    def __init__(self, which):
+        self.which = which
+
+    def __missing__(self, nodes):
+        self[nodes] = _transforms(nodes)[self.which]
+        return self[nodes]
+
+
+_TO_CHEBYSHEV, _TO_POWERS = _Cache(0), _Cache(1)

@@ -1,0 +1,45 @@
+"""What became of a phase or a plan: one name each, never a NaN without one."""
+
+import enum
+
+
+class Status(enum.IntEnum):
+    """Outcome of a trace, a simulated phase or a whole plan.
+
+    The numeric values travel through compiled programs and batches; `name` (lower case) is what the files print.
+    """
+
+    OK = 0
+    CONTACT_LOST = 1
+    STUCK = 2
+    REVERSED = 3
+    NOT_REACHED = 4
+    LEFT_FORMATION = 5
+    AMBIGUOUS = 6
+    SINGULAR = 7
+    NO_CONVERGENCE = 8
+    MAX_STEPS = 9
+
+    @property
+    def label(self) -> str:
+        """The name that summary files and messages use, e.g. `contact_lost`."""
+        return self.name.lower()
+
+    @property
+    def advice(self) -> str:
+        """What the status means and what to try, in one sentence."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Status.OK: "every contact stays in compression and the object arrives as planned",
+    Status.CONTACT_LOST: "a contact force turns tensile; squeeze harder, move more slowly, or optimise the torques",
+    Status.STUCK: "friction holds the object at rest; raise the torque that pushes it, or lower the squeeze",
+    Status.REVERSED: "the object moves backward along its wire; raise the torque that pushes it",
+    Status.NOT_REACHED: "time ran out before the object arrived; give the phase more time or more torque",
+    Status.LEFT_FORMATION: "the wire ends while the object still moves; brake earlier, or let the phase arrive moving",
+    Status.AMBIGUOUS: "friction allows forward and backward motion at once (Painleve); lower the friction or the squeeze",
+    Status.SINGULAR: "the equations of motion or the C-functions lose rank (wedging, fold or branch); change the formation",
+    Status.NO_CONVERGENCE: "Newton's method or the table did not reach its tolerance; check the start, or refine the table",
+    Status.MAX_STEPS: "the step limit was reached; raise it, or shorten the phase",
+}

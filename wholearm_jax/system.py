@@ -1,0 +1,101 @@
+"""One formation's mechanics in the object's own units, so that no result depends on the choice of metre or kilogram.
+
+Length unit: the largest distance of a vertex from the centre of mass. Mass unit: the object's mass. Time stays in
+seconds. Angles and `z = (x, y, phi, theta1, theta2)` are then all of order one.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from wholearm_jax.contacts import Contacts, contacts, every_contact
+from wholearm_jax.scene import EDGE, Body, Formation, Hand
+
+
+class System(eqx.Module):
+    """A formation on a hand, dimensionless but for time.
+
+    `inertia` is the diagonal of `M = diag(m, m, I, J1, J2)`; `viscous` and `dry` are B and D; `gravity` is an
+    acceleration. `candidates` are all pairs that may touch; `watched` marks those that could end the formation.
+    `length` [m] and `mass` [kg] are the units; `torque_limit` stays in N m.
+    """
+
+    contacts: Contacts
+    candidates: Contacts
+    watched: Bool[Array, "candidates"]
+    inertia: Float[Array, "5"]
+    viscous: Float[Array, "2"]
+    dry: Float[Array, "2"]
+    gravity: Float[Array, "2"]
+    length: Float[Array, ""]
+    mass: Float[Array, ""]
+    torque_limit: Float[Array, "2"]
+
+    @property
+    def configuration_unit(self) -> Float[Array, "5"]:
+        """What one unit of each coordinate of `z` is in metres or radians."""
+        return configuration_unit(self.length)
+
+    @property
+    def torque_unit(self) -> Float[Array, ""]:
+        """What one unit of torque is in N m, for times in seconds."""
+        return self.mass * self.length**2
+
+    @property
+    def force_unit(self) -> Float[Array, ""]:
+        """What one unit of force is in N, for times in seconds."""
+        return self.mass * self.length
+
+
+def configuration_unit(length: Float[Array, ""]) -> Float[Array, "5"]:
+    """`z` in SI units is `z` in object units times this."""
+    one = jnp.ones_like(length)
+    return jnp.stack([length, length, one, one, one])
+
+
+def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Formation) -> System:
+    """Scale a formation by the object's size and mass. The units are constants to differentiation."""
+    length = jax.lax.stop_gradient(jnp.sqrt((body.vertices**2).sum(1).max()))
+    mass = jax.lax.stop_gradient(body.mass)
+    rotary = mass * length**2
+    small_body = Body(body.vertices / length, body.count, body.mass / mass, body.inertia / rotary, body.friction)
+    small_hand = Hand(
+        joint=hand.joint / length,
+        length=hand.length / length,
+        offset=hand.offset / length,
+        inertia=hand.inertia / rotary,
+        viscous=hand.viscous / rotary,
+        dry=hand.dry / rotary,
+        torque_limit=hand.torque_limit,
+    )
+    pairs = every_contact(body.vertices.shape[0])
+    heavy = jnp.stack([small_body.mass, small_body.mass, small_body.inertia])
+    return System(
+        contacts=contacts(small_body, small_hand, formation),
+        candidates=contacts(small_body, small_hand, pairs),
+        watched=_watched(pairs, formation, body),
+        inertia=jnp.concatenate([heavy, small_hand.inertia]),
+        viscous=small_hand.viscous,
+        dry=small_hand.dry,
+        gravity=gravity / length,
+        length=length,
+        mass=mass,
+        torque_limit=hand.torque_limit,
+    )
+
+
+def _watched(pairs: Formation, formation: Formation, body: Body) -> Bool[Array, "candidates"]:
+    """Pairs of real features that are not in the formation and do not coincide with one of its contacts."""
+
+    def same(link, kind, feature):
+        return (formation.link == link) & (formation.kind == kind) & (formation.feature == feature)
+
+    member = jax.vmap(same)(pairs.link, pairs.kind, pairs.feature).any(1)
+    # A tip on an edge whose two ends both lie on that finger has no gap of its own: the edge is flush with the link.
+    count = body.count
+    after = jnp.where(pairs.feature + 1 < count, pairs.feature + 1, 0)
+    here = jax.vmap(same)(pairs.link, jnp.zeros_like(pairs.kind), pairs.feature).any(1)
+    there = jax.vmap(same)(pairs.link, jnp.zeros_like(pairs.kind), after).any(1)
+    flush = (pairs.kind == EDGE) & here & there
+    return (pairs.feature < count) & ~member & ~flush

@@ -1,0 +1,505 @@
+r"""Trace: the curve `z(s)` on which a formation of four constraints moves, its ends, kinks and nodes.
+
+Four C-functions in five unknowns leave a wire that depends on geometry alone. It is charted by the linear coordinate
+`s = s_ref + u . (z - z_ref)` (object units, see `system`), `u` being the unit tangent where the chart begins; a wire
+that turns away from `u` continues in a new chart, so turning points of single coordinates are nothing special. The
+search below (march, watch, bracket) runs on constants; every place that it finds is then the root of five equations
+in five unknowns, from which derivatives follow (`newton.differentiable`).
+
+A wire is cut into *pieces* where a contact's slip or a joint's speed reverses, or the chart changes: within a piece
+everything is smooth. Pieces are cut into panels with Chebyshev nodes, at which `reduction` tabulates.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float, Int
+
+from wholearm_jax.contacts import frames, gaps, normal_rows, slip_rows
+from wholearm_jax.newton import differentiable, newton
+from wholearm_jax.scene import Heading
+from wholearm_jax.status import Status
+from wholearm_jax.system import System
+
+MAX_MARCH = 256  # nodes of the march: wires of up to about 12 radians or object radii
+LONGEST, SHORTEST = 0.06, 2e-3  # march steps, and the step at which an end counts as bracketed
+NO_END, MADE, LEFT, UNTIL = range(4)  # why a wire ends
+
+
+class Resolution(NamedTuple):
+    """Sizes of a wire's table: at most `pieces` smooth pieces, `panels` panels in all, `nodes` Chebyshev nodes each."""
+
+    pieces: int = 6
+    panels: int = 32
+    nodes: int = 8
+
+
+class Wire(eqx.Module):
+    """A traced wire in object units. Pieces beyond `count` are empty and lie at the wire's end.
+
+    Piece `k` covers `[breaks[k], breaks[k + 1]]` in the chart `chart[k]` about (`anchor[k]`, `anchor_s[k]`); `factor[k]`
+    is the ratio of `ds/dt` after entering the piece to that before. `slip_sign` (Xi) and `joint_sign` hold for forward
+    travel. Panels `first[k] ... first[k] + panels[k] - 1` belong to piece `k`; `nodes[p, i]` is `z` at node `i` of
+    panel `p`. `end_why` says why the wire ends and `end_contact` which contact is made (a row of
+    `System.candidates`) or leaves its feature (a row of `System.contacts`).
+    """
+
+    status: Int[Array, ""]
+    start: Float[Array, "5"]
+    end: Float[Array, "5"]
+    end_why: Int[Array, ""]
+    end_contact: Int[Array, ""]
+    residual: Float[Array, ""]
+    start_gaps: Float[Array, "contacts"]
+    count: Int[Array, ""]
+    breaks: Float[Array, "pieces_1"]
+    chart: Float[Array, "pieces 5"]
+    anchor: Float[Array, "pieces 5"]
+    anchor_s: Float[Array, "pieces"]
+    factor: Float[Array, "pieces"]
+    slip_sign: Float[Array, "pieces contacts"]
+    joint_sign: Float[Array, "pieces 2"]
+    first: Int[Array, "pieces"]
+    panels: Int[Array, "pieces"]
+    owner: Int[Array, "panels"]
+    nodes: Float[Array, "panels nodes 5"]
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """The wire's extent in `s`."""
+        return self.breaks[-1] - self.breaks[0]
+
+
+def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resolution: Resolution) -> Wire:
+    """Project `rough` (SI) onto the formation and follow its wire as `heading` says, to its end.
+
+    Never raises for a configuration that does not work: `Wire.status` says `no_convergence` (the contacts cannot all
+    touch near the start; `start_gaps` tells which stay open), `singular` (fold or branch), `max_steps` (no end within
+    reach) or `ok`.
+    """
+    rough = rough / system.configuration_unit
+    until = heading.until_value / system.configuration_unit[heading.until_coordinate]
+    heading = eqx.tree_at(lambda h: h.until_value, heading, until)
+    fixed, fixed_heading = stop_gradient(system), stop_gradient(heading)
+
+    start, residual = _project(fixed, stop_gradient(rough))
+    first_tangent = _oriented(fixed, start, fixed_heading)
+    landing = (_START, first_tangent)
+    start = differentiable(lambda z, s, r: _conditions(s, heading, z, landing[1], r)[_START], start, system, rough)
+    march = _march(fixed, fixed_heading, stop_gradient(start), first_tangent)
+    places = _places(system, heading, fixed, fixed_heading, march, resolution)
+    wire = _cut(system, fixed, march, places, start, resolution)
+    touching = residual < 100 * jnp.finfo(rough.dtype).eps
+    direction = jnp.abs(first_tangent[heading.coordinate]) > 1e-6
+    worst = jnp.select(
+        [~touching, ~direction, march.status > 0, places.failed | wire.status.astype(bool)],
+        [int(Status.NO_CONVERGENCE), int(Status.SINGULAR), march.status, int(Status.NO_CONVERGENCE)],
+        0,
+    )
+    return eqx.tree_at(
+        lambda w: (w.status, w.residual, w.start_gaps),
+        wire,
+        (worst, residual, gaps(fixed.contacts, start) * fixed.length),
+    )
+
+
+# --- the five equations that fix a place on the wire -----------------------------------------------------------------
+
+_START = 0  # nearest to the rough start
+_SLIP, _JOINT = 1, 5  # slip of contact i, speed of joint j vanish
+_WATCH = 7  # watched values: candidate gaps, room below and above along each contact's feature, `until`
+
+
+def tangent(system: System, z: Float[Array, "5"], hint: Float[Array, "5"]) -> Float[Array, "5"]:
+    """Unit null vector of `G_n` with a positive component along `hint`."""
+    rows = jnp.concatenate([normal_rows(system.contacts, z), hint[None]])
+    x = jnp.linalg.solve(rows, jnp.zeros(5, z.dtype).at[4].set(1.0))
+    return x / jnp.sqrt(x @ x)
+
+
+def _watch(system, heading, z):
+    """Values that must stay positive along the wire, and how far along its feature each candidate contact lies."""
+    pairs, held = frames(system.candidates, z), frames(system.contacts, z)
+    sense = jnp.where(heading.until_coordinate < 0, 0.0, 1.0)
+    ahead = (heading.until_value - z[heading.until_coordinate]) * sense + (1 - sense)
+    room = [held.along - system.contacts.lower, system.contacts.upper - held.along]
+    return jnp.concatenate([pairs.gap, *room, ahead[None]]), pairs.along
+
+
+def _conditions(system, heading, z, hint, rough):
+    """All `[C_n; r]` with the fifth equations `r` that may fix a place, one row each."""
+    x = tangent(system, z, hint)
+    slip = slip_rows(system.contacts, z) @ x
+    fifth = jnp.concatenate([(x @ (z - rough))[None], slip, x[3:], _watch(system, heading, z)[0]])
+    held = jnp.broadcast_to(gaps(system.contacts, z), (fifth.shape[0], 4))
+    return jnp.concatenate([held, fifth[:, None]], axis=1)
+
+
+def _project(system, rough):
+    """The wire's point nearest to the rough start: least-norm Newton steps to reach it, then Newton on nearness."""
+
+    def least(z):
+        rows = normal_rows(system.contacts, z)
+        move = -jnp.linalg.pinv(rows) @ gaps(system.contacts, z)
+        return z + move * jnp.minimum(1.0, 0.3 / jnp.maximum(jnp.abs(move).max(), 1e-30))
+
+    z = jax.lax.fori_loop(0, 12, lambda _, z: least(z), rough)
+    hint = jnp.linalg.svd(normal_rows(system.contacts, z))[2][4]
+    root = newton(lambda z: _conditions(system, _NOWHERE, z, hint, rough)[_START], z)
+    near = jnp.where(root.residual < 1e-6, root.z, z)
+    return near, jnp.abs(gaps(system.contacts, near)).max()
+
+
+_NOWHERE = Heading(np.asarray(0), np.asarray(1.0), np.asarray(-1), np.asarray(0.0))
+
+
+def _oriented(system, z, heading):
+    """The unit tangent at `z` whose coordinate `heading.coordinate` has the sign asked for."""
+    null = jnp.linalg.svd(normal_rows(system.contacts, z))[2][4]
+    return null * jnp.where(null[heading.coordinate] * heading.sign < 0, -1.0, 1.0)
+
+
+# --- the march -------------------------------------------------------------------------------------------------------
+
+
+class _March(NamedTuple):
+    """Nodes along the wire: `n` of them, in charts numbered by `chart`; the last is where the end was bracketed."""
+
+    n: Int[Array, ""]
+    step: Float[Array, ""]
+    z: Float[Array, "march 5"]
+    x: Float[Array, "march 5"]
+    s: Float[Array, "march"]
+    chart: Int[Array, "march"]
+    charts: Float[Array, "charts 5"]
+    anchors: Float[Array, "charts 5"]
+    anchor_s: Float[Array, "charts"]
+    number: Int[Array, ""]
+    values: Float[Array, "watch"]
+    rates: Float[Array, "watch"]
+    along: Float[Array, "candidates"]
+    end: Int[Array, ""]
+    end_z: Float[Array, "5"]
+    status: Int[Array, ""]
+    done: Float[Array, ""]
+
+
+_CHARTS = 8
+
+
+def _march(system, heading, z, x):
+    """Follow the wire in short steps until something ends it; remember the nodes."""
+    sense = jnp.where(heading.until_value < z[heading.until_coordinate], -1.0, 1.0)
+    eps = jnp.finfo(z.dtype).eps
+    tolerance = eps**0.625
+
+    def watch(z, x, u):
+        def signed(z):
+            values, along = _watch(system, heading, z)
+            return values.at[-1].multiply(jnp.where(heading.until_coordinate < 0, 1.0, sense)), along
+
+        (values, along), (rates, _) = jax.jvp(signed, (z,), (x / (u @ x),))
+        return values, rates, along
+
+    def buffer(row):
+        return jnp.zeros((MAX_MARCH, *row.shape), row.dtype).at[0].set(row)
+
+    values, rates, along = watch(z, x, x)
+    zero = jnp.zeros((), z.dtype)
+    begin = _March(
+        n=jnp.asarray(1),
+        step=jnp.asarray(LONGEST, z.dtype),
+        z=buffer(z),
+        x=buffer(x),
+        s=jnp.full(MAX_MARCH, jnp.inf, z.dtype).at[0].set(0.0),
+        chart=jnp.zeros(MAX_MARCH, int),
+        charts=jnp.zeros((_CHARTS, 5), z.dtype).at[0].set(x),
+        anchors=jnp.zeros((_CHARTS, 5), z.dtype).at[0].set(z),
+        anchor_s=jnp.zeros(_CHARTS, z.dtype),
+        number=jnp.asarray(0),
+        values=values,
+        rates=rates,
+        along=along,
+        end=jnp.asarray(-1),
+        end_z=z,
+        status=jnp.asarray(0),
+        done=jnp.asarray(False),
+    )
+
+    def step(m: _March) -> _March:
+        z, x, u = m.z[m.n - 1], m.x[m.n - 1], m.charts[m.number]
+        z_new, moved = _correct(system, u, z + m.step * x / (u @ x), u @ z + m.step)
+        x_new = tangent(system, z_new, u)
+        values, rates, along = watch(z_new, x_new, u)
+        good = (moved < 1e-8) & (x_new @ x > 0.98) & jnp.all(jnp.isfinite(x_new))
+        crossed, where = _crossings(system, m, values, rates, along, tolerance)
+        ends = good & jnp.any(crossed)
+        bracketed = ends & (m.step <= SHORTEST)
+        accept = good & ~jnp.any(crossed)
+        first = jnp.argmin(jnp.where(crossed, where, jnp.inf))
+        row = jnp.where(accept | bracketed, m.n, MAX_MARCH)
+        turn = accept & (u @ x_new < 0.6)
+        number = m.number + turn
+        chart_row = jnp.where(turn, number, _CHARTS)
+        s_new = m.s[m.n - 1] + m.step
+        shorter = jnp.where(ends, jnp.maximum(m.step / 4, SHORTEST), m.step / 2)
+        lost = ~good & (m.step < 1e-6)
+        full = (m.n + 1 >= MAX_MARCH) | (number >= _CHARTS)
+        return _March(
+            n=m.n + (accept | bracketed),
+            step=jnp.where(accept, jnp.minimum(m.step * 1.5, LONGEST), shorter),
+            z=m.z.at[row].set(z_new, mode="drop"),
+            x=m.x.at[row].set(x_new, mode="drop"),
+            s=m.s.at[row].set(s_new, mode="drop"),
+            chart=m.chart.at[row].set(m.number, mode="drop"),
+            charts=m.charts.at[chart_row].set(x_new, mode="drop"),
+            anchors=m.anchors.at[chart_row].set(z_new, mode="drop"),
+            anchor_s=m.anchor_s.at[chart_row].set(s_new, mode="drop"),
+            number=number,
+            values=jnp.where(accept, values, m.values),
+            rates=jnp.where(accept, rates * (u @ x_new) / jnp.where(turn, 1.0, u @ x_new), m.rates),
+            along=jnp.where(accept, along, m.along),
+            end=jnp.where(bracketed, first, m.end),
+            end_z=jnp.where(bracketed, z + (z_new - z) * where[first], m.end_z),
+            status=jnp.select([lost, full & ~bracketed], [int(Status.SINGULAR), int(Status.MAX_STEPS)], 0),
+            done=bracketed | lost | full,
+        )
+
+    return jax.lax.while_loop(lambda m: ~m.done, step, begin)
+
+
+def _correct(system, u, z, height, steps=4):
+    """Newton in the chart: the point of the wire on the plane `u . z = height`, and the last step's size."""
+
+    def once(_, state):
+        z, _ = state
+        rows = jnp.concatenate([normal_rows(system.contacts, z), u[None]])
+        left = jnp.concatenate([gaps(system.contacts, z), (u @ z - height)[None]])
+        move = jnp.linalg.solve(rows, left)
+        return z - move, jnp.abs(move).max()
+
+    z, moved = jax.lax.fori_loop(0, steps, once, (z, jnp.asarray(jnp.inf, z.dtype)))
+    return z, jnp.where(jnp.isfinite(moved), moved, jnp.inf)
+
+
+def _crossings(system, m, values, rates, along, tolerance):
+    """Which watched values turn negative within a step (or dip below zero and return), and at what share of it."""
+    through = (m.values >= -tolerance) & (values < -tolerance)
+    slope = jnp.where(rates > m.rates, rates - m.rates, 1.0)
+    turns = (m.rates < 0) & (rates > 0) & (m.values > tolerance) & (values > tolerance)
+    dips = turns & (m.values - m.step * m.rates**2 / (2 * slope) < 0)
+    fall = jnp.where(through, m.values - values, 1.0)
+    where = jnp.where(through, jnp.clip(m.values / fall, 0.0, 1.0), -m.rates / slope)
+    pairs = system.candidates.lower.shape[0]
+    at = m.along + (along - m.along) * where[:pairs]
+    inside = (at >= system.candidates.lower - tolerance) & (at <= system.candidates.upper + tolerance)
+    counts = jnp.concatenate([inside & system.watched, jnp.ones(values.shape[0] - pairs, bool)])
+    return (through | dips) & counts, where
+
+
+# --- ends and kinks, located as roots --------------------------------------------------------------------------------
+
+
+class _Places(NamedTuple):
+    """The wire's end and its kinks in order; `s` is infinite for unused rows."""
+
+    z: Float[Array, "places 5"]
+    s: Float[Array, "places"]
+    chart: Int[Array, "places"]
+    end: Float[Array, "5"]
+    end_s: Float[Array, ""]
+    failed: Float[Array, ""]
+
+
+def _coordinate(march, chart, z):
+    return march.anchor_s[chart] + march.charts[chart] @ (z - march.anchors[chart])
+
+
+def _places(system, heading, fixed, fixed_heading, march, resolution):
+    """Sharpen the bracketed end and every sign change of slips and joint speeds to rounding level."""
+    rows = jnp.arange(MAX_MARCH)
+    live = rows < march.n
+    reversing = jax.vmap(lambda z, x: jnp.concatenate([slip_rows(fixed.contacts, z) @ x, x[3:]]))(march.z, march.x)
+    flips, share = _flips(reversing, live)
+    turns = live & (rows > 0) & (march.chart != jnp.roll(march.chart, 1))
+    found = jnp.concatenate([flips, turns[:, None]], axis=1)
+    before = jnp.roll(march.s, 1).at[0].set(0.0)
+    key = jnp.where(found, before[:, None] + jnp.concatenate([share, jnp.zeros((MAX_MARCH, 1))], 1) * SHORTEST, jnp.inf)
+    order = jnp.argsort(key.ravel())[: resolution.pieces - 1]
+    used = jnp.isfinite(key.ravel()[order])
+    segment, what = order // 7, order % 7
+
+    def one(segment, what, used):
+        left, right = march.z[segment - 1], march.z[segment]
+        fraction = jnp.where(what < 6, share[segment, jnp.minimum(what, 5)], 0.0)
+        guess = jnp.where(used, left + fraction * (right - left), march.z[0])
+        hint = march.x[jnp.maximum(segment - 1, 0)]
+        chart = march.chart[segment]
+        plane = jnp.concatenate([fixed_zero, jnp.zeros(1)])
+
+        def equations(z, system, heading):
+            conditions = _conditions(system, heading, z, hint, march.z[0])[_SLIP + jnp.minimum(what, 5)]
+            on_plane = jnp.concatenate([conditions[:4], (hint @ (z - stop_gradient(guess)))[None]])
+            return jnp.where(used & (what < 6), conditions, on_plane)
+
+        root = newton(lambda z: equations(z, fixed, fixed_heading), guess)
+        z = differentiable(equations, root.z, system, heading)
+        s = _coordinate(march, chart, z)
+        low, high = before[segment] - 1e-6, march.s[segment] + 1e-6
+        wrong = used & ((root.residual > 1e-8) | (s < low) | (s > high))
+        del plane
+        return z, jnp.where(used, s, jnp.inf), chart, wrong
+
+    fixed_zero = jnp.zeros(4)
+    z, s, chart, wrong = jax.vmap(one)(segment, what, used)
+    order = jnp.argsort(stop_gradient(s))
+
+    last = jnp.maximum(march.n - 1, 0)
+    hint = march.x[last]
+
+    def ending(z, system, heading):
+        conditions = _conditions(system, heading, z, hint, march.z[0])[_WATCH + jnp.maximum(march.end, 0)]
+        frozen = jnp.concatenate([conditions[:4], (hint @ (z - march.end_z))[None]])
+        return jnp.where(march.end >= 0, conditions, frozen)
+
+    root = newton(lambda z: ending(z, fixed, fixed_heading), march.end_z)
+    end = differentiable(ending, root.z, system, heading)
+    end_s = _coordinate(march, march.chart[last], end)
+    off = (march.end >= 0) & ((root.residual > 1e-8) | (jnp.abs(end_s - march.s[last]) > 4 * SHORTEST))
+    return _Places(z[order], s[order], chart[order], end, end_s, jnp.any(wrong) | off)
+
+
+def _flips(values, live):
+    """Sign changes of columns between rows `i - 1` and `i`, zeros taking the last sign seen; and their share of it."""
+    tolerance = jnp.finfo(values.dtype).eps ** 0.625
+    sign = jnp.where(jnp.abs(values) > tolerance, jnp.sign(values), 0.0)
+    rows = jnp.arange(values.shape[0])[:, None]
+    last = jax.lax.cummax(jnp.where(sign != 0, rows, -1), axis=0)
+    held = jnp.where(last >= 0, jnp.take_along_axis(sign, jnp.maximum(last, 0), axis=0), 0.0)
+    before, was = jnp.roll(held, 1, axis=0), jnp.roll(values, 1, axis=0)
+    flips = (held * before < 0) & live[:, None] & (rows > 0)
+    fall = jnp.where(flips, was - values, 1.0)
+    return flips, jnp.clip(jnp.where(flips, was / fall, 0.0), 0.0, 1.0)
+
+
+# --- pieces, panels and nodes ----------------------------------------------------------------------------------------
+
+
+def chebyshev(nodes: int) -> np.ndarray:
+    """Chebyshev points of the first kind on [-1, 1], increasing."""
+    return -np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)
+
+
+def _cut(system, fixed, march, places, start, resolution):
+    """Lay panels over the pieces and solve the C-functions at every node."""
+    inside = jnp.isfinite(places.s) & (stop_gradient(places.s) < stop_gradient(places.end_s))
+    count = inside.sum() + 1
+    end_s = places.end_s
+    start_s = _coordinate(march, 0, start)
+    kinks = jnp.where(inside, jnp.where(inside, places.s, 0.0), end_s)
+    breaks = jnp.concatenate([start_s[None], kinks, end_s[None]])
+    last = march.chart[jnp.maximum(march.n - 1, 0)]
+    # Piece k ends at place k, which lies in the chart of the segment before it.
+    owner_chart = jnp.concatenate([jnp.where(inside, places.chart, last), last[None]])
+    chart, anchor, anchor_s = march.charts[owner_chart], march.anchors[owner_chart], march.anchor_s[owner_chart]
+
+    entry = jnp.concatenate([start[None], places.z])
+    before = jnp.concatenate([chart[:1], chart[:-1]])
+    x_entry = jax.vmap(lambda z, u: tangent(system, z, u))(entry, before)
+    factor = jnp.where(
+        jnp.arange(resolution.pieces) < count, (chart * x_entry).sum(1) / (before * x_entry).sum(1), 1.0
+    )
+
+    first, panels, owner = _panels(stop_gradient(breaks), count, resolution)
+    local = (jnp.arange(resolution.panels) - first[owner])[:, None] + (chebyshev(resolution.nodes) + 1) / 2
+    low, high = breaks[owner][:, None], breaks[owner + 1][:, None]
+    s = low + (high - low) * local / panels[owner][:, None]
+    guess = _interpolate(march, places, stop_gradient(s), chart[owner])
+
+    def node(s, guess, u, anchor, anchor_s):
+        height = u @ anchor + s - anchor_s
+        z, moved = _correct(fixed, u, guess, stop_gradient(height), steps=3)
+
+        def equations(z, system, height):
+            return jnp.concatenate([gaps(system.contacts, z), (u @ z - height)[None]])
+
+        rows = jnp.concatenate([normal_rows(fixed.contacts, stop_gradient(z)), u[None]])
+        return z - jnp.linalg.solve(stop_gradient(rows), equations(stop_gradient(z), system, height)), moved
+
+    per_panel = jax.vmap(node, (0, 0, None, None, None))
+    nodes, moved = jax.vmap(per_panel)(s, guess, chart[owner], anchor[owner], anchor_s[owner])
+    slip_sign, joint_sign, missed = _signs(fixed, stop_gradient(nodes), chart, owner, resolution)
+    pairs = system.candidates.lower.shape[0]
+    contact = jnp.where(march.end < pairs, march.end, (march.end - pairs) % 4)
+    why = jnp.select([march.end < 0, march.end < pairs, march.end < pairs + 8], [NO_END, MADE, LEFT], UNTIL)
+    return Wire(
+        status=(missed | (moved.max() > 1e-6)).astype(int),
+        start=start,
+        end=places.end,
+        end_why=why,
+        end_contact=contact,
+        residual=jnp.zeros(()),
+        start_gaps=jnp.zeros(4),
+        count=count,
+        breaks=breaks,
+        chart=chart,
+        anchor=anchor,
+        anchor_s=anchor_s,
+        factor=factor,
+        slip_sign=slip_sign,
+        joint_sign=joint_sign,
+        first=first,
+        panels=panels,
+        owner=owner,
+        nodes=nodes,
+    )
+
+
+def _panels(breaks, count, resolution):
+    """Share the panels among the pieces by length, at least one each."""
+    lengths = jnp.diff(breaks)
+    live = jnp.arange(resolution.pieces) < count
+    spare = resolution.panels - count
+    share = jnp.floor(spare * jnp.where(live, lengths, 0.0) / jnp.maximum(lengths.sum(), 1e-30)).astype(int)
+    panels = jnp.where(live, 1 + share, 0)
+    # What rounding leaves over goes to the last piece that is used.
+    panels = panels.at[count - 1].add(resolution.panels - panels.sum())
+    first = jnp.concatenate([jnp.zeros(1, int), jnp.cumsum(panels)[:-1]])
+    owner = jnp.searchsorted(jnp.cumsum(panels), jnp.arange(resolution.panels), side="right")
+    return first, panels, owner
+
+
+def _interpolate(march, places, s, u):
+    """Cubic Hermite guess of `z` at every `s` from the march's nodes."""
+    right = jnp.clip(jnp.searchsorted(march.s, s), 1, jnp.maximum(march.n - 1, 1))
+    left = right - 1
+    width = march.s[right] - march.s[left]
+    width = jnp.where(jnp.isfinite(width) & (width > 0), width, 1.0)[..., None]
+    f = ((s - march.s[left])[..., None]) / width
+    slope = [march.x[k] / jnp.einsum("pni,pi->pn", march.x[k], u)[..., None] * width for k in (left, right)]
+    low, high = march.z[left], march.z[right]
+    return (
+        low * (1 + 2 * f) * (1 - f) ** 2
+        + high * f**2 * (3 - 2 * f)
+        + slope[0] * f * (1 - f) ** 2
+        + slope[1] * f**2 * (f - 1)
+    )
+
+
+def _signs(system, nodes, chart, owner, resolution):
+    """Signs of slips and joint speeds of each piece, and whether any node contradicts its piece's sign."""
+
+    def speeds(z, u):
+        x = tangent(system, z, u)
+        return jnp.concatenate([slip_rows(system.contacts, z) @ x, x[3:]])
+
+    values = jax.vmap(jax.vmap(speeds, (0, None)))(nodes, chart[owner])
+    total = jax.ops.segment_sum(values.sum(1), owner, resolution.pieces)
+    tolerance = jnp.finfo(nodes.dtype).eps ** 0.625
+    signs = jnp.where(jnp.abs(total) > tolerance, jnp.sign(total), 0.0)
+    missed = jnp.any(values * signs[owner][:, None] < -tolerance) | ~jnp.all(jnp.isfinite(values))
+    return signs[:, :4], signs[:, 4:], missed
