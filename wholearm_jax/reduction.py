@@ -157,11 +157,14 @@ def _place(wire, panel, at):
 
 
 def _tail(values):
-    """The last two Chebyshev coefficients of every panel against the largest value of each function."""
+    """The last two Chebyshev coefficients of every panel against the largest value of each function.
+
+    Functions a hundred thousand times smaller than their largest companion are judged against that.
+    """
     coefficients = jnp.einsum("kn,pn...->pk...", _TO_CHEBYSHEV[values.shape[1]], jax.lax.stop_gradient(values))
     tail = jnp.abs(coefficients[:, -2:]).sum(1).max(0)
     size = jnp.abs(values).max((0, 1))
-    return (tail / jnp.maximum(size, 1e-9 * size.max() + 1e-300)).max()
+    return (tail / jnp.maximum(size, 1e-5 * size.max() + 1e-300)).max()
 
 
 def _transforms(nodes):

@@ -1,0 +1,195 @@
+r"""Score: the compressive margin of a motion, exact in time, and the smooth minimum that is optimised.
+
+Between accepted steps `s(u)` is the quintic with the right `s`, `ds/du` and `d2s/du2` at both ends, so that forces are
+known at every time, not only at steps. The margin is the least `c_n` over continuous time and all contacts: samples
+find its neighbourhood, Newton's method its place. Its derivative is that of the force at the place found (the envelope
+theorem), landings and knots included.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
+
+from wholearm_jax.motion import Motion, acceleration
+from wholearm_jax.reduction import Table, horner, powers
+from wholearm_jax.schedule import Window, torque_in
+
+SAMPLES = 7  # places in a step at which forces are sampled before the minimum is refined
+REFINED = 4  # lowest samples refined; a minimum is missed only if four others sample lower
+
+
+class Score(eqx.Module):
+    """The least contact force of a phase: `margin` [N], its time as a share of the phase, its `s` and contact number.
+
+    `lost` is the share at which a force first turns tensile (infinite if none does), `lost_contact` whose.
+    """
+
+    margin: Float[Array, ""]
+    share: Float[Array, ""]
+    s: Float[Array, ""]
+    contact: Int[Array, ""]
+    lost: Float[Array, ""]
+    lost_contact: Int[Array, ""]
+
+
+class Arcs(eqx.Module):
+    """The steps of a motion as quintics: everything that forces within step `i` depend on."""
+
+    share: Float[Array, "steps 2"]
+    quintic: Float[Array, "steps 6"]
+    piece: Int[Array, "steps"]
+    row: Int[Array, "steps"]
+    held: Bool[Array, "steps"]
+    live: Bool[Array, "steps"]
+
+
+def arcs(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion) -> Arcs:
+    """Quintic Hermite arcs in `xi` in [0, 1] between the steps' ends."""
+    live = jnp.arange(motion.held.shape[0]) < motion.count
+    width = motion.share[1:] - motion.share[:-1]
+    s0, s1 = motion.s[:-1], motion.s[1:]
+    d0, d1 = motion.entry_w * width, motion.w[1:] * width
+
+    def bend(share, s, w):
+        at = jax.vmap(lambda *place: acceleration(table, seen, duration, *place))
+        return at(motion.piece, motion.row, share, s, w) * width**2
+
+    moving = live & ~motion.held
+    d0, d1 = jnp.where(moving, d0, 0.0), jnp.where(moving, d1, 0.0)
+    b0 = jnp.where(moving, bend(motion.share[:-1], s0, motion.entry_w), 0.0)
+    b1 = jnp.where(moving, bend(motion.share[1:], s1, motion.w[1:]), 0.0)
+    rise = s1 - s0
+    quintic = [
+        s0,
+        d0,
+        b0 / 2,
+        10 * rise - 6 * d0 - 4 * d1 - 1.5 * b0 + b1 / 2,
+        -15 * rise + 8 * d0 + 7 * d1 + 1.5 * b0 - b1,
+        6 * rise - 3 * (d0 + d1) - (b0 - b1) / 2,
+    ]
+    ends = jnp.stack([motion.share[:-1], motion.share[1:]], axis=1)
+    return Arcs(ends, jnp.stack(quintic, axis=1), motion.piece, motion.row, motion.held, live)
+
+
+def on_arc(arc: Arcs, xi: Float[Array, ""]):
+    """Share, `s` and `w` at `xi` of one arc (no leading axis)."""
+    width = arc.share[1] - arc.share[0]
+    s = horner(arc.quintic, xi)
+    slope = horner(arc.quintic[1:] * jnp.arange(1.0, 6.0), xi)
+    moving = arc.live & ~arc.held & (width > 0)
+    return arc.share[0] + xi * width, s, jnp.where(moving, slope / jnp.where(moving, width, 1.0), 0.0)
+
+
+def force(table: Table, seen: Window, duration, piece, row, share, s, w) -> Float[Array, "contacts"]:
+    """Contact forces `c_n` [N] for forward travel."""
+    panel, xi = powers(table, piece, s)
+    terms = horner(table.force[panel], xi)
+    v = w / duration
+    one = jnp.ones_like(v)
+    return terms @ jnp.concatenate([jnp.stack([one, v**2, v]), torque_in(seen, row, share)])
+
+
+def forces_on(table: Table, seen: Window, duration, arc: Arcs, xi) -> Float[Array, "contacts"]:
+    """Contact forces at `xi` of one arc."""
+    share, s, w = on_arc(arc, xi)
+    return force(table, seen, duration, arc.piece, arc.row, share, s, w)
+
+
+def sampled_forces(table: Table, seen: Window, duration, steps: Arcs) -> Float[Array, "steps samples contacts"]:
+    """Forces at evenly spaced places of every step, its two ends included; infinite where nothing moves."""
+    xi = jnp.linspace(0.0, 1.0, SAMPLES, dtype=steps.quintic.dtype)
+    at = jax.vmap(jax.vmap(forces_on, (None, None, None, None, 0)), (None, None, None, 0, None))
+    values = at(table, seen, duration, steps, xi)
+    return jnp.where((steps.live & ~steps.held)[:, None, None], values, jnp.inf)
+
+
+def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion) -> Score:
+    """The margin of a simulated phase."""
+    steps = arcs(table, seen, duration, motion)
+    values = stop_gradient(sampled_forces(table, seen, duration, steps))
+    per_step = values.min(1)
+    _, lowest = jax.lax.top_k(-per_step.ravel(), REFINED)
+
+    def refine(flat):
+        step, contact = flat // values.shape[2], flat % values.shape[2]
+        arc = jax.tree.map(lambda a: a[step], steps)
+        seat = jnp.argmin(values[step, :, contact]) / (SAMPLES - 1)
+        fixed = stop_gradient((table, seen, duration, arc))
+
+        def one(xi):
+            return forces_on(*fixed, xi)[contact]
+
+        xi = _minimise(one, seat, 1.0 / (SAMPLES - 1))
+        here = forces_on(table, seen, duration, arc, xi)[contact]
+        share, s, _ = on_arc(arc, xi)
+        return jnp.where(arc.live & ~arc.held, here, jnp.inf), share, s, contact
+
+    margin, share, s, contact = jax.vmap(refine)(lowest)
+    best = jnp.argmin(stop_gradient(margin))
+    lost, lost_contact = _first_tension(*stop_gradient((table, seen, duration, steps)), values)
+    return Score(margin[best], share[best], s[best], contact[best], lost, lost_contact)
+
+
+def soft_minimum(values: Float[Array, "n"], temperature: Float[Array, ""]) -> Float[Array, ""]:
+    r"""The smooth minimum `max_m m + temperature * sum_i log(values_i - m)`'s maximiser `m`.
+
+    `m` solves `sum_i temperature / (values_i - m) = 1`, so that `min - n temperature <= m <= min - temperature`; its
+    derivative weighs each value by its closeness to `m`. Infinite values are left out.
+    """
+    fixed, low = stop_gradient(values), stop_gradient(values).min()
+    live = jnp.isfinite(fixed)
+
+    def excess(m, values):
+        room = jnp.where(live, jnp.where(live, values, 0.0) - m, jnp.inf)
+        return (temperature / room).sum() - 1.0, (temperature / room**2).sum()
+
+    def step(_, m):
+        over, slope = excess(m, fixed)
+        return m - over / slope
+
+    m = jax.lax.fori_loop(0, 40, step, low - temperature)
+    over, slope = excess(m, values)
+    return m - over / stop_gradient(slope)
+
+
+def _minimise(function, seat, reach):
+    """The least point of `function` within `reach` of `seat` in [0, 1]: Newton on the slope, bisecting a bracket."""
+    slope = jax.grad(function)
+    low, high = jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0)
+
+    def narrow(_, state):
+        low, high, xi = state
+        g, curve = jax.jvp(slope, (xi,), (jnp.ones_like(xi),))
+        low, high = jnp.where(g < 0, xi, low), jnp.where(g < 0, high, xi)
+        guess = xi - g / jnp.where(curve > 0, curve, 1.0)
+        fine = (curve > 0) & (guess > low) & (guess < high)
+        return low, high, jnp.where(fine, guess, (low + high) / 2)
+
+    # An edge of the bracket counts as the least point where the slope says so.
+    _, _, inner = jax.lax.fori_loop(0, 12, narrow, (low, high, (low + high) / 2))
+    places = jnp.stack([low, inner, high])
+    return stop_gradient(places[jnp.argmin(jax.vmap(function)(places))])
+
+
+def _first_tension(table, seen, duration, steps, values):
+    """The share at which a contact force first turns negative, by bisection from the first sample that is."""
+    least = values.min(2)
+    negative = least < 0
+    first = jnp.argmax(negative.ravel())
+    step, sample = first // SAMPLES, first % SAMPLES
+    arc = jax.tree.map(lambda a: a[step], steps)
+    width = 1.0 / (SAMPLES - 1)
+    high = sample * width
+
+    def halve(_, bracket):
+        low, high = bracket
+        middle = (low + high) / 2
+        tensile = forces_on(table, seen, duration, arc, middle).min() < 0
+        return jnp.where(tensile, low, middle), jnp.where(tensile, middle, high)
+
+    _, xi = jax.lax.fori_loop(0, 50, halve, (jnp.maximum(high - width, 0.0), high))
+    contact = jnp.argmin(forces_on(table, seen, duration, arc, xi))
+    share = on_arc(arc, xi)[0]
+    return jnp.where(jnp.any(negative), share, jnp.inf), contact

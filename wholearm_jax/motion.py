@@ -1,0 +1,322 @@
+r"""Simulate: one phase as a scalar second-order ODE along its wire, integrated by diffrax.
+
+Time runs as a share `u` of the phase's duration `T`, and `w = v T` is the speed in `s` per duration, so that steps and
+tolerances mean the same for every size and duration:
+
+    ds/du = w,    dw/du = T^2 (A0 + A3 tau1 + A4 tau2) + T A2 w + A1 w^2
+
+with the coefficients of `reduction.Table`. A phase is a sequence of smooth stages. Each stage is one `diffeqsolve`
+whose steps end on the torque's knots; it stops at the first step that leaves the piece or turns the speed negative.
+That step is then taken again with the length that lands exactly on the piece's end, or on rest, so that the method
+keeps its order across slip reversals and the landing carries its own derivatives.
+
+At rest, with friction, the object starts forward when the acceleration with forward signs is positive, backward when
+the one with backward signs is negative, and stays when neither is; both at once is ambiguous (Painleve).
+"""
+
+from typing import NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
+
+from wholearm_jax.reduction import Table, horner, powers
+from wholearm_jax.schedule import Window, interval, torque_in
+from wholearm_jax.status import Status
+
+ADJOINTS = {
+    "both": dfx.DirectAdjoint(),  # forward and reverse mode
+    "forward": dfx.ForwardMode(),
+    "reverse": dfx.RecursiveCheckpointAdjoint(),
+}
+
+
+class Integration(eqx.Module):
+    """How to integrate: diffrax solver, error `tolerance` a step (relative, of the wire's scale), limits, adjoint.
+
+    `steps` says that the torque schedule has steps inside the phase. `adjoint` is one of `"both"`, `"forward"`,
+    `"reverse"`: what the solve will be differentiated by. All of it is static.
+    """
+
+    solver: dfx.AbstractSolver = eqx.field(static=True, default=dfx.Dopri8())
+    tolerance: float = eqx.field(static=True, default=1e-10)
+    max_steps: int = eqx.field(static=True, default=256)
+    stages: int = eqx.field(static=True, default=8)
+    steps: bool = eqx.field(static=True, default=False)
+    adjoint: str = eqx.field(static=True, default="both")
+
+
+class Motion(eqx.Module):
+    """The accepted steps of a phase, `count` of them: from node `i` to node `i + 1` in time, `s` and `w`.
+
+    Step `i` lies in piece `piece[i]` and torque interval `row[i]`; `held[i]` marks waiting at rest. `share` is time in
+    durations. Rows beyond `count` repeat the end. `status` is that of the end alone: `ok` (end of time while moving),
+    `left_formation` (the wire's end), `stuck`, `reversed`, `ambiguous` or `max_steps`.
+    """
+
+    share: Float[Array, "nodes"]
+    s: Float[Array, "nodes"]
+    w: Float[Array, "nodes"]
+    entry_w: Float[Array, "steps"]
+    piece: Int[Array, "steps"]
+    row: Int[Array, "steps"]
+    held: Bool[Array, "steps"]
+    count: Int[Array, ""]
+    status: Int[Array, ""]
+
+
+class _State(NamedTuple):
+    share: Float[Array, ""]
+    s: Float[Array, ""]
+    w: Float[Array, ""]
+    piece: Int[Array, ""]
+    count: Int[Array, ""]
+    status: Int[Array, ""]
+    done: Bool[Array, ""]
+    nodes: Float[Array, "nodes 3"]
+    entry_w: Float[Array, "steps"]
+    pieces: Int[Array, "steps"]
+    held: Bool[Array, "steps"]
+
+
+def move(
+    table: Table,
+    seen: Window,
+    duration: Float[Array, ""],
+    *,
+    how: Integration,
+    s: Float[Array, ""] | None = None,
+    speed: Float[Array, ""] | float = 0.0,
+    free: bool | Bool[Array, ""] = False,
+) -> Motion:
+    """Move along a wire for one phase, from its start (or `s`) at `speed` [1/s].
+
+    `free` lets the motion pass rest and the wire's end with forward signs: a smooth continuation that optimisation may
+    differentiate, not physics; only an honest run (`free=False`) decides what happens.
+    """
+    capacity = how.max_steps
+    dtype = table.breaks.dtype
+    begin = table.breaks[0] if s is None else jnp.asarray(s, dtype)
+    w = jnp.asarray(speed, dtype) * duration
+    first = jnp.stack([jnp.zeros((), dtype), begin, w])
+    state = _State(
+        share=first[0],
+        s=begin,
+        w=w,
+        piece=jnp.asarray(0),
+        count=jnp.asarray(0),
+        status=jnp.asarray(int(Status.MAX_STEPS)),
+        done=jnp.asarray(False),
+        nodes=jnp.broadcast_to(first, (capacity + 1, 3)),
+        entry_w=jnp.zeros(capacity, dtype),
+        pieces=jnp.zeros(capacity, int),
+        held=jnp.zeros(capacity, bool),
+    )
+    free = jnp.asarray(free)
+
+    def stage(state, _):
+        return jax.lax.cond(state.done, lambda s: s, lambda s: _stage(table, seen, duration, how, free, s), state), None
+
+    state, _ = jax.lax.scan(stage, state, None, length=how.stages)
+    beyond = jnp.arange(capacity + 1) > state.count
+    nodes = jnp.where(beyond[:, None], state.nodes[state.count], state.nodes)
+    middle = (nodes[:-1, 0] + nodes[1:, 0]) / 2
+    return Motion(
+        share=nodes[:, 0],
+        s=nodes[:, 1],
+        w=nodes[:, 2],
+        entry_w=state.entry_w,
+        piece=state.pieces,
+        row=jax.vmap(lambda m: interval(seen, m))(stop_gradient(middle)),
+        held=state.held,
+        count=state.count,
+        status=state.status,
+    )
+
+
+def acceleration(table: Table, seen: Window, duration, piece, row, share, s, w):
+    """`dw/du` for forward travel in a piece and a torque interval."""
+    panel, xi = powers(table, piece, s)
+    a = horner(table.acceleration[panel], xi)
+    tau = torque_in(seen, row, share)
+    return duration**2 * (a[0] + a[3] * tau[0] + a[4] * tau[1]) + duration * a[2] * w + a[1] * w**2
+
+
+def _stage(table, seen, duration, how, free, state: _State) -> _State:
+    """Wait at rest if need be, then move until the piece ends, the object stops, or time is over."""
+    rest = (state.w <= 0) & ~free
+    share, verdict = _departure(table, seen, state)
+    share = jnp.where(rest, share, state.share)
+    verdict = jnp.where(rest, verdict, int(Status.OK))
+    waited = rest & (share > state.share)
+    state = _append(state, waited, share, state.s, state.w, state.w, held=True)
+    blocked = verdict != int(Status.OK)
+
+    last = state.piece >= table.count - 1
+    goal = table.breaks[state.piece + 1] + jnp.where(free & last, jnp.inf, 0.0)
+    floor = jnp.where(free, -jnp.inf, 0.0)
+    final = jnp.where(blocked, state.share, 1.0)
+
+    def field(u, y, _):
+        row = interval(seen, u)
+        return jnp.stack([y[1], acceleration(table, seen, duration, state.piece, row, u, y[0], y[1])])
+
+    y0 = jnp.stack([state.s, state.w])
+    knots = stop_gradient(seen.share)
+    control = dfx.ClipStepSizeController(
+        dfx.PIDController(rtol=how.tolerance, atol=how.tolerance),
+        step_ts=knots,
+        jump_ts=knots if how.steps else None,
+    )
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(field),
+        how.solver,
+        state.share,
+        final,
+        jnp.asarray(1 / 32, y0.dtype),
+        y0,
+        saveat=dfx.SaveAt(steps=True),
+        stepsize_controller=control,
+        event=dfx.Event(lambda t, y, args, **_: (y[0] > goal) | (y[1] < floor)),
+        adjoint=ADJOINTS[how.adjoint],
+        max_steps=how.max_steps,
+        throw=False,
+    )
+    taken = solution.stats["num_accepted_steps"]
+    overshot = dfx.is_event(solution.result)
+    complete = dfx.is_successful(solution.result) | overshot
+    rows = jnp.arange(how.max_steps)
+    kept = jnp.where(overshot, taken - 1, taken)
+    live = rows < kept
+    # Unused rows are infinite: put numbers there before anything is computed from them.
+    times = jnp.where(live, solution.ts, state.share)
+    steps = jnp.where(live[:, None], solution.ys, y0)
+    start = state.count
+    place = jnp.where(live, start + 1 + rows, how.max_steps + 1)
+    nodes = state.nodes.at[place].set(jnp.concatenate([times[:, None], steps], axis=1), mode="drop")
+    entered = jnp.concatenate([y0[1:], steps[:-1, 1]])
+    state = state._replace(
+        nodes=nodes,
+        entry_w=state.entry_w.at[place - 1].set(entered, mode="drop"),
+        pieces=state.pieces.at[place - 1].set(state.piece, mode="drop"),
+        count=start + kept,
+    )
+    share, s, w = (nodes[start + kept, k] for k in range(3))
+    last_time = jnp.where(overshot, solution.ts[jnp.maximum(taken - 1, 0)], 1.0)
+    last_y = jnp.where(overshot, solution.ys[jnp.maximum(taken - 1, 0)], y0 * 0 + 1.0)
+    passed = overshot & (last_y[0] > goal)
+    landed = _land(table, seen, duration, how, state.piece, (share, s, w), last_time, goal, passed, overshot)
+    land_share, land_s, land_w = landed
+    state = _append(state, overshot, land_share, land_s, land_w, w, held=False)
+    onward = passed & ~last
+    factor = table.factor[jnp.minimum(state.piece + 1, table.factor.shape[0] - 1)]
+    # `done` waits for the next stage where the object has come to rest: it may start again.
+    status = jnp.select(
+        [blocked, ~complete, passed & last, overshot],
+        [verdict, int(Status.MAX_STEPS), int(Status.LEFT_FORMATION), int(Status.MAX_STEPS)],
+        int(Status.OK),
+    )
+    return state._replace(
+        share=jnp.where(overshot, land_share, share),
+        s=jnp.where(overshot, land_s, s),
+        w=jnp.where(overshot, land_w, w) * jnp.where(onward, factor, 1.0),
+        piece=state.piece + onward,
+        status=status,
+        done=blocked | ~complete | (passed & last) | ~overshot,
+    )
+
+
+def _append(state, wanted, share, s, w, entry_w, *, held):
+    """Add one step to the record where `wanted`."""
+    capacity = state.entry_w.shape[0]
+    place = jnp.where(wanted & (state.count < capacity), state.count + 1, capacity + 1)
+    return state._replace(
+        nodes=state.nodes.at[place].set(jnp.stack([share, s, w]), mode="drop"),
+        entry_w=state.entry_w.at[place - 1].set(entry_w, mode="drop"),
+        pieces=state.pieces.at[place - 1].set(state.piece, mode="drop"),
+        held=state.held.at[place - 1].set(held, mode="drop"),
+        count=state.count + (place <= capacity),
+    )
+
+
+def _departure(table, seen, state):
+    """When an object at rest at `s` starts to move, and what it does: `ok`, `reversed`, `ambiguous` or `stuck`.
+
+    The accelerations at rest are linear in the torque, hence piecewise linear in time: their first signs are exact.
+    """
+    panel, xi = powers(table, state.piece, state.s)
+    ahead = horner(table.acceleration[panel], xi)[jnp.array([0, 3, 4])]
+    behind = -horner(table.backward[panel], xi)
+    rows = jnp.arange(seen.slope.shape[0])
+    low = jnp.maximum(seen.share[:-1], state.share)
+    high = jnp.minimum(seen.share[1:], 1.0)
+    live = (rows >= seen.first) & (rows <= seen.last) & (high >= low)
+    tau_low = jax.vmap(torque_in, (None, 0, 0))(seen, rows, low)
+
+    def first(pull):
+        value = pull[0] + tau_low @ pull[1:]
+        rate = seen.slope @ pull[1:]
+        root = low - value / jnp.where(rate > 0, rate, 1.0)
+        at = jnp.where(value > 0, low, jnp.where((rate > 0) & (root < high), root, jnp.inf))
+        at = jnp.where(live, at, jnp.inf)
+        k = jnp.argmin(stop_gradient(at))
+        return at[k]
+
+    forward, backward = first(ahead), first(behind)
+    both = (forward == backward) & jnp.isfinite(forward)
+    verdict = jnp.select(
+        [both, forward < backward, backward < forward],
+        [int(Status.AMBIGUOUS), int(Status.OK), int(Status.REVERSED)],
+        int(Status.STUCK),
+    )
+    at = jnp.minimum(forward, backward)
+    return jnp.where(jnp.isfinite(at), jnp.where(jnp.isfinite(at), at, 0.0), 1.0), verdict
+
+
+def _land(table, seen, duration, how, piece, node, end, goal, passed, wanted):
+    """Retake the last step from `node` with the length that lands on `s = goal` (`passed`) or on `w = 0`."""
+    share, s, w = node
+    longest = jnp.where(wanted, end - share, 0.0)
+    row = interval(seen, stop_gradient(share + longest / 2))
+    target = jnp.where(passed, jnp.where(jnp.isfinite(goal), goal, 0.0), 0.0)
+    which = jnp.where(passed, 0, 1)
+    solver = eqx.tree_at(lambda x: x.scan_kind, how.solver, "bounded", is_leaf=lambda x: x is None)
+
+    def field(u, y, args):
+        table, seen, duration = args
+        return jnp.stack([y[1], acceleration(table, seen, duration, piece, row, u, y[0], y[1])])
+
+    term = dfx.ODETerm(field)
+
+    def step(share, length, y, args):
+        state = solver.init(term, share, share + length, y, args)
+        return solver.step(term, share, share + length, y, args, state, made_jump=True)[0]
+
+    args = (table, seen, duration)
+    fixed = stop_gradient((share, jnp.stack([s, w]), args, target, longest))
+
+    def narrow(_, bracket):
+        """Newton on the step's length, bisecting where it would leave the bracket."""
+        low, high, length = bracket
+        y = step(fixed[0], length, fixed[1], fixed[2])
+        miss = jnp.where(passed, y[0] - fixed[3], -y[1])
+        rate = field(fixed[0] + length, y, fixed[2])
+        rate = jnp.where(passed, rate[0], -rate[1])
+        low, high = jnp.where(miss < 0, length, low), jnp.where(miss < 0, high, length)
+        guess = length - miss / jnp.where(rate == 0, 1.0, rate)
+        return low, high, jnp.where((guess >= low) & (guess <= high), guess, (low + high) / 2)
+
+    _, _, length = jax.lax.fori_loop(0, 12, narrow, (0 * fixed[4], fixed[4], fixed[4] / 2))
+    y = step(share, length, jnp.stack([s, w]), args)
+    rate = stop_gradient(field(share + length, y, args))
+    pace = jnp.where(wanted & (rate[which] != 0), rate[which], 1.0)
+    late = jnp.where(wanted, (target - y[which]) / pace, 0.0)
+    y = y + rate * late
+    return (
+        share + length + late,
+        jnp.where(passed, target, y[0]),
+        jnp.where(passed, y[1], 0.0),
+    )

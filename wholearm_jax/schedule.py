@@ -1,0 +1,87 @@
+"""Torque schedules: two joint torques over time, linear between rows; a repeated time is a step."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+
+class Torque(eqx.Module):
+    """A torque schedule: `times` [s], non-decreasing, and `values` [N m], one row `(tau1, tau2)` a time.
+
+    A time that stands twice is a step: the first row holds before it, the second from it on.
+    """
+
+    times: Float[Array, "rows"]
+    values: Float[Array, "rows 2"]
+
+
+class Window(eqx.Module):
+    """A schedule seen from one phase: `share` is time in durations of the phase, 0 at its start and 1 at its end.
+
+    Interval `k` runs from row `k` to row `k + 1`; those from `first` to `last` cover the phase. `slope` is the torque's
+    rate per duration.
+    """
+
+    share: Float[Array, "rows"]
+    values: Float[Array, "rows 2"]
+    slope: Float[Array, "rows_less_1 2"]
+    first: Int[Array, ""]
+    last: Int[Array, ""]
+
+
+def torque(times, values) -> Torque:
+    """Build a schedule, checked: at least two rows, finite, times sorted, no time more than twice."""
+    times, values = jnp.asarray(times, float), jnp.asarray(values, float)
+    clock = np.asarray(times)
+    if clock.ndim != 1 or clock.size < 2 or values.shape != (clock.size, 2):
+        raise ValueError("a torque schedule needs at least two rows of t, tau1, tau2")
+    if not (np.all(np.isfinite(clock)) and np.all(np.isfinite(np.asarray(values)))):
+        raise ValueError("a torque schedule must be finite")
+    if np.any(np.diff(clock) < 0) or np.any(clock[2:] == clock[:-2]):
+        raise ValueError("times must not decrease, and none may stand more than twice")
+    return Torque(times, values)
+
+
+def has_steps(schedule: Torque, start: float, end: float) -> bool:
+    """Whether the schedule steps strictly between two times (a static choice for the integrator)."""
+    times = np.asarray(schedule.times)
+    stepped = times[1:][np.diff(times) == 0]
+    return bool(np.any((stepped > start) & (stepped < end)))
+
+
+def padded(schedule: Torque, multiple: int = 32) -> Torque:
+    """The same schedule with its last row repeated, so that schedules of like length share a compiled program."""
+    missing = -schedule.times.shape[0] % multiple
+    ramp = schedule.times[-1] + (schedule.times[-1] - schedule.times[0]) * jnp.arange(1, missing + 1)
+    rows = jnp.broadcast_to(schedule.values[-1], (missing, 2))
+    return Torque(jnp.concatenate([schedule.times, ramp]), jnp.concatenate([schedule.values, rows]))
+
+
+def window(schedule: Torque, start: Float[Array, ""], duration: Float[Array, ""]) -> Window:
+    """A schedule over one phase."""
+    times = schedule.times
+    gap = jnp.diff(times)
+    rise = jnp.diff(schedule.values, axis=0)
+    slope = jnp.where((gap > 0)[:, None], rise / jnp.where(gap > 0, gap, 1.0)[:, None], 0.0) * duration
+    intervals = times.shape[0] - 1
+    first = jnp.searchsorted(times, start, side="right") - 1
+    last = jnp.searchsorted(times, start + duration, side="left") - 1
+    first = jnp.clip(first, 0, intervals - 1)
+    return Window(
+        share=(times - start) / duration,
+        values=schedule.values,
+        slope=slope,
+        first=first,
+        last=jnp.clip(last, first, intervals - 1),
+    )
+
+
+def interval(seen: Window, share: Float[Array, ""]) -> Int[Array, ""]:
+    """The interval that holds at a share of the phase; a step belongs to what follows it, except at the phase's end."""
+    return jnp.clip((share >= seen.share).sum() - 1, seen.first, seen.last)
+
+
+def torque_in(seen: Window, row: Int[Array, ""], share: Float[Array, ""]) -> Float[Array, "2"]:
+    """The torque [N m] of interval `row` at a share of the phase."""
+    return seen.values[row] + seen.slope[row] * (share - seen.share[row])
