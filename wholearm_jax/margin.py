@@ -97,9 +97,9 @@ def forces_on(table: Table, seen: Window, duration, arc: Arcs, xi) -> Float[Arra
     return force(table, seen, duration, arc.piece, arc.row, share, s, w)
 
 
-def sampled_forces(table: Table, seen: Window, duration, steps: Arcs) -> Float[Array, "steps samples contacts"]:
+def sampled_forces(table: Table, seen: Window, duration, steps: Arcs, samples: int = SAMPLES) -> Float[Array, "steps samples contacts"]:
     """Forces at evenly spaced places of every step, its two ends included; infinite where nothing moves."""
-    xi = jnp.linspace(0.0, 1.0, SAMPLES, dtype=steps.quintic.dtype)
+    xi = jnp.linspace(0.0, 1.0, samples, dtype=steps.quintic.dtype)
     at = jax.vmap(jax.vmap(forces_on, (None, None, None, None, 0)), (None, None, None, 0, None))
     values = at(table, seen, duration, steps, xi)
     return jnp.where((steps.live & ~steps.held)[:, None, None], values, jnp.inf)
@@ -132,26 +132,26 @@ def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion
     return Score(margin[best], share[best], s[best], contact[best], lost, lost_contact)
 
 
-def soft_minimum(values: Float[Array, "n"], temperature: Float[Array, ""]) -> Float[Array, ""]:
-    r"""The smooth minimum `max_m m + temperature * sum_i log(values_i - m)`'s maximiser `m`.
+def smooth_margin(values, weights, temperature: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    r"""The smooth loss's counterpart of `min values`: `phi = max_m [ m + T sum_i w_i log((values_i - m) / T) ]`.
 
-    `m` solves `sum_i temperature / (values_i - m) = 1`, so that `min - n temperature <= m <= min - temperature`; its
-    derivative weighs each value by its closeness to `m`. Infinite values are left out.
+    `T` is the temperature [N] and `w` non-negative weights; `m`, returned second, solves `sum_i T w_i / (values_i - m) = 1`
+    and lies between `min - T sum(w)` and `min`. `phi` is concave in the values and its gradient `T w_i / (values_i - m)`
+    sums to one. Entries of zero weight are left out.
     """
-    fixed, low = stop_gradient(values), stop_gradient(values).min()
-    live = jnp.isfinite(fixed)
-
-    def excess(m, values):
-        room = jnp.where(live, jnp.where(live, values, 0.0) - m, jnp.inf)
-        return (temperature / room).sum() - 1.0, (temperature / room**2).sum()
+    live = stop_gradient(weights) > 0
+    values = jnp.where(live, values, 0.0)
+    fixed = stop_gradient(values)
+    low = jnp.where(live, fixed, jnp.inf).min()
+    heaviest = jnp.where(live & (fixed <= low), weights, 0.0).max()
 
     def step(_, m):
-        over, slope = excess(m, fixed)
-        return m - over / slope
+        room = jnp.where(live, fixed - m, 1.0)
+        over = temperature * (weights / room).sum() - 1.0
+        return m - over / (temperature * (weights / room**2).sum())
 
-    m = jax.lax.fori_loop(0, 40, step, low - temperature)
-    over, slope = excess(m, values)
-    return m - over / stop_gradient(slope)
+    m = stop_gradient(jax.lax.fori_loop(0, 40, step, low - temperature * heaviest))
+    return m + temperature * (weights * jnp.log(jnp.where(live, values - m, 1.0) / temperature)).sum(), m
 
 
 def _minimise(function, seat, reach):

@@ -1,0 +1,207 @@
+r"""Descend: torque knots of one phase, improved by gradient descent through the simulation.
+
+The variables `p` are the torques at the knots, in units of the torque limit, and the logarithm of the duration. The
+loss is minus the smooth margin (`margin.smooth_margin`) plus logarithmic barriers of the same temperature on torque,
+rate and duration limits. Arrival at rest, `e(p) = (s(T) - s_end, w(T)) / length = 0`, is an equality constraint.
+
+Descent is preconditioned: with `J` the derivatives of the sampled forces, `H = J^T phi'' J` (the Gauss-Newton metric of
+the loss, plus the barriers' own) and `E = de/dp`, the direction solves
+
+    [ H  E^T ] [ d ]     [ grad ]
+    [ E   0  ] [ . ] = - [   e  ]
+
+so that neither units, nor an unstable motion, nor the number of knots slows it. The direction is an optax gradient
+transformation, and so is its step length; any other optax optimiser may take their place (`projected`).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
+
+from wholearm_jax.margin import arcs, on_arc, sampled_forces, smooth_margin
+from wholearm_jax.motion import Integration, move
+from wholearm_jax.reduction import Table
+from wholearm_jax.schedule import Torque, window
+
+SAMPLES = 4  # forces a step that the loss sees
+RESTORE = 100.0  # weight of the squared arrival error in the line search's merit, in newtons
+
+
+class Limits(eqx.Module):
+    """What the result must respect: torque rates [N m/s], durations [s], and which knots stay as they are."""
+
+    rate: Float[Array, "2"]
+    shortest: Float[Array, ""]
+    longest: Float[Array, ""]
+    pinned: Bool[Array, "knots"]
+
+
+class Linear(NamedTuple):
+    """The loss and the arrival at `p`, with their derivatives."""
+
+    loss: Float[Array, ""]
+    gradient: Float[Array, "p"]
+    metric: Float[Array, "p p"]
+    arrival: Float[Array, "2"]
+    arrival_rows: Float[Array, "2 p"]
+
+
+def pack(values: Float[Array, "knots 2"], duration: Float[Array, ""], table: Table) -> Float[Array, "p"]:
+    """Torques at the knots and a duration as variables."""
+    return jnp.concatenate([(values / table.torque_limit).ravel(), jnp.log(duration)[None]])
+
+
+def unpack(p: Float[Array, "p"], table: Table) -> tuple[Torque, Float[Array, ""]]:
+    """Variables as a schedule from time 0, knots evenly spaced, and a duration."""
+    values = p[:-1].reshape(-1, 2) * table.torque_limit
+    duration = jnp.exp(p[-1])
+    return Torque(jnp.linspace(0.0, 1.0, values.shape[0]) * duration, values), duration
+
+
+def observe(p, table: Table, how: Integration):
+    """Sampled forces, their weights (shares of time), and the arrival error of the free motion under `p`."""
+    schedule, duration = unpack(p, table)
+    # Knots are fixed shares of the phase: only the torques and the duration carry derivatives.
+    seen = window(schedule, jnp.zeros(()), duration)
+    seen = eqx.tree_at(lambda w: w.share, seen, stop_gradient(seen.share))
+    motion = move(table, seen, duration, how=how, free=True)
+    steps = arcs(table, seen, duration, motion)
+    forces = sampled_forces(table, seen, duration, steps, SAMPLES)
+    width = stop_gradient(steps.share[:, 1] - steps.share[:, 0])
+    weights = jnp.where((steps.live & ~steps.held)[:, None, None], width[:, None, None] / SAMPLES, 0.0)
+    weights = jnp.broadcast_to(weights, forces.shape)
+    share, _, pace = jax.vmap(jax.vmap(on_arc, (None, 0)), (0, None))(steps, jnp.linspace(0.0, 1.0, SAMPLES))
+    pace = pace / table.length
+    inside = (weights[..., 0] > 0) & (share > 1e-9) & (share < 1 - 1e-9)
+    pace = jnp.where(inside, pace, 1.0)
+    arrival = jnp.stack([motion.s[-1] - table.breaks[-1], motion.w[-1]]) / table.length
+    return jnp.where(weights > 0, forces, 0.0), weights, pace, arrival
+
+
+def barrier(p, table: Table, limits: Limits):
+    """`-sum log` of the room within torque, rate and duration limits, each group weighing one."""
+    values, duration = p[:-1].reshape(-1, 2), jnp.exp(p[-1])
+    knots = values.shape[0]
+    step = limits.rate / table.torque_limit * duration / (knots - 1)
+    bounded = jnp.isfinite(step)
+    climb = jnp.where(bounded, jnp.diff(values, axis=0) / jnp.where(bounded, step, 1.0), 0.0)
+    room = jnp.concatenate([1 - values**2, 1 - climb**2]) / knots * knots
+    span = jnp.log(limits.longest / limits.shortest)
+    free = span > 0
+    ends = jnp.stack([p[-1] - jnp.log(limits.shortest), jnp.log(limits.longest) - p[-1]]) / jnp.where(free, span, 1.0)
+    ends = jnp.where(free, ends, 1.0)
+    return -jnp.log(room).sum() / knots - jnp.log(ends).sum()
+
+
+@eqx.filter_jit
+def linearise(p, table: Table, limits: Limits, temperature, how: Integration) -> Linear:
+    """Loss, gradient, Gauss-Newton metric and arrival at `p`, by forward mode through the simulation."""
+
+    def both(p):
+        forces, weights, pace, arrival = observe(p, table, how)
+        return (forces, pace, arrival), (forces, weights, pace, arrival)
+
+    (rows, pace_rows, arrival_rows), (forces, weights, pace, arrival) = jax.jacfwd(both, has_aux=True)(p)
+    value, m = smooth_margin(forces, weights, temperature)
+    room = jnp.where(weights > 0, forces - m, 1.0)
+    share = (temperature * weights / room).ravel()
+    curve = (temperature * weights / room**2).ravel()
+    rows = rows.reshape(-1, p.shape[0])
+    middle = curve @ rows
+    metric = (rows * curve[:, None]).T @ rows - jnp.outer(middle, middle) / curve.sum()
+    metric, pull_back, backward = _keep_moving(metric, pace, weights, pace_rows, temperature)
+    wall, pull, bend = barrier(p, table, limits), jax.grad(barrier)(p, table, limits), jax.hessian(barrier)(p, table, limits)
+    still = jnp.concatenate([jnp.repeat(limits.pinned, 2), (limits.longest <= limits.shortest)[None]])
+    gradient = jnp.where(still, 0.0, -share @ rows + temperature * pull - pull_back)
+    metric = jnp.where(still[:, None] | still[None], 0.0, metric + temperature * bend)
+    metric = metric + jnp.diag(jnp.where(still, 1.0, 1e-9 * jnp.trace(metric) / p.shape[0]))
+    return Linear(-value + temperature * wall + backward, gradient, metric, arrival, jnp.where(still, 0.0, arrival_rows))
+
+
+def _keep_moving(metric, pace, weights, rows, temperature):
+    """Add the barrier `-T sum w log(speed)` to a metric; its gradient's negative and its value."""
+    each = temperature * weights[..., 0]
+    rows = rows.reshape(-1, rows.shape[-1])
+    pull = (each / pace).ravel()
+    return metric + (rows * (each / pace**2).ravel()[:, None]).T @ rows, pull @ rows, -(each * jnp.log(pace)).sum()
+
+
+def merit(p, table: Table, limits: Limits, temperature, how: Integration):
+    """Loss plus the weighted square of the arrival error; infinite outside the limits."""
+    forces, weights, pace, arrival = observe(p, table, how)
+    value, _ = smooth_margin(forces, weights, temperature)
+    total = -value + temperature * barrier(p, table, limits) + RESTORE * arrival @ arrival
+    total = total - temperature * (weights[..., 0] * jnp.log(pace)).sum()
+    return jnp.where(jnp.isfinite(total), total, jnp.inf)
+
+
+def direction() -> optax.GradientTransformationExtraArgs:
+    """The preconditioned, arrival-keeping descent direction as an optax transformation; wants `linear=`."""
+
+    def update(updates, state, params=None, *, linear: Linear, **_):
+        n = linear.gradient.shape[0]
+        top = jnp.concatenate([linear.metric, linear.arrival_rows.T], axis=1)
+        bottom = jnp.concatenate([linear.arrival_rows, jnp.zeros((2, 2), top.dtype)], axis=1)
+        right = jnp.concatenate([linear.gradient, linear.arrival])
+        return -jnp.linalg.solve(jnp.concatenate([top, bottom]), right)[:n], state
+
+    return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)
+
+
+def projected(optimiser: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
+    """Any optax optimiser, its updates projected onto the arrival's tangent, with a least step back to it."""
+    optimiser = optax.with_extra_args_support(optimiser)
+
+    def update(updates, state, params=None, *, linear: Linear, **extra):
+        rows = linear.arrival_rows
+        updates, state = optimiser.update(updates, state, params, **extra)
+        back = rows.T @ jnp.linalg.solve(rows @ rows.T, rows @ updates + linear.arrival)
+        return updates - back, state
+
+    return optax.GradientTransformationExtraArgs(optimiser.init, update)
+
+
+def descend() -> optax.GradientTransformationExtraArgs:
+    """The default: the preconditioned direction with a backtracking line search on the merit."""
+    search = optax.scale_by_backtracking_linesearch(max_backtracking_steps=10, slope_rtol=1e-4, decrease_factor=0.5)
+    return optax.chain(direction(), search)
+
+
+@eqx.filter_jit
+def advance(p, state, linear: Linear, table: Table, limits: Limits, temperature, how: Integration, optimiser):
+    """One step of an optax optimiser."""
+    e, rows = linear.arrival, linear.arrival_rows
+    updates, state = optimiser.update(
+        linear.gradient,
+        state,
+        p,
+        linear=linear,
+        value=linear.loss + RESTORE * e @ e,
+        grad=linear.gradient + 2 * RESTORE * e @ rows,
+        value_fn=lambda q, linear: merit(q, table, limits, temperature, how),
+    )
+    return p + updates, state
+
+
+@eqx.filter_jit
+def restore(p, linear: Linear, table: Table, how: Integration, steps: int = 8):
+    """Return to the arrival with the least change in the metric: Newton's method on `e` with the rows of `linear`."""
+    rows = linear.arrival_rows
+    spread = jnp.linalg.solve(linear.metric, rows.T)
+    back = spread @ jnp.linalg.inv(rows @ spread)
+
+    def step(state):
+        p, _, count = state
+        e = observe(p, table, how)[3]
+        move = back @ e
+        longest = jnp.abs(move).max()
+        return p - move * jnp.minimum(1.0, 0.1 / jnp.maximum(longest, 1e-30)), jnp.abs(e).max(), count + 1
+
+    start = (p, jnp.asarray(jnp.inf, p.dtype), 0)
+    p, _, _ = jax.lax.while_loop(lambda s: (s[1] > 1e-11) & (s[2] < steps), step, start)
+    return p
