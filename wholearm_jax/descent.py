@@ -11,7 +11,8 @@ the loss, plus the barriers' own) and `E = de/dp`, the direction solves
     [ E   0  ] [ . ] = - [   e  ]
 
 so that neither units, nor an unstable motion, nor the number of knots slows it. The direction is an optax gradient
-transformation, and so is its step length; any other optax optimiser may take their place (`projected`).
+transformation; any other optax optimiser may take its place (`projected`). A step counts only after its return to the
+arrival, and is shortened until it lowers the loss there.
 """
 
 from typing import NamedTuple
@@ -29,7 +30,8 @@ from wholearm_jax.reduction import Table
 from wholearm_jax.schedule import Torque, window
 
 SAMPLES = 4  # forces a step that the loss sees
-RESTORE = 100.0  # weight of the squared arrival error in the line search's merit, in newtons
+ARRIVED = 1e-11  # arrival error, in wire lengths, below which a step counts as having arrived
+RETURNS, CUTS, SHORTER = 8, 10, 0.4  # Newton steps back to the arrival, shortenings of a step, and by how much
 
 
 class Limits(eqx.Module):
@@ -132,22 +134,23 @@ def _keep_moving(metric, pace, weights, rows, temperature):
 
 
 def merit(p, table: Table, limits: Limits, temperature, how: Integration):
-    """Loss plus the weighted square of the arrival error; infinite outside the limits."""
+    """The loss and the arrival error of `p`; the loss is infinite outside the limits or where the motion turns back."""
     forces, weights, pace, arrival = observe(p, table, how)
     value, _ = smooth_margin(forces, weights, temperature)
-    total = -value + temperature * barrier(p, table, limits) + RESTORE * arrival @ arrival
-    total = total - temperature * (weights[..., 0] * jnp.log(pace)).sum()
-    return jnp.where(jnp.isfinite(total), total, jnp.inf)
+    backward = -(weights[..., 0] * jnp.log(pace)).sum()
+    total = -value + temperature * (barrier(p, table, limits) + backward)
+    allowed = jnp.all(jnp.abs(p[:-1]) < 1) & jnp.isfinite(total)
+    return jnp.where(allowed, total, jnp.inf), arrival
 
 
-def direction() -> optax.GradientTransformationExtraArgs:
+def preconditioned() -> optax.GradientTransformationExtraArgs:
     """The preconditioned, arrival-keeping descent direction as an optax transformation; wants `linear=`."""
 
     def update(updates, state, params=None, *, linear: Linear, **_):
-        n = linear.gradient.shape[0]
+        n = updates.shape[0]
         top = jnp.concatenate([linear.metric, linear.arrival_rows.T], axis=1)
         bottom = jnp.concatenate([linear.arrival_rows, jnp.zeros((2, 2), top.dtype)], axis=1)
-        right = jnp.concatenate([linear.gradient, linear.arrival])
+        right = jnp.concatenate([updates, linear.arrival])
         return -jnp.linalg.solve(jnp.concatenate([top, bottom]), right)[:n], state
 
     return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)
@@ -166,42 +169,51 @@ def projected(optimiser: optax.GradientTransformation) -> optax.GradientTransfor
     return optax.GradientTransformationExtraArgs(optimiser.init, update)
 
 
-def descend() -> optax.GradientTransformationExtraArgs:
-    """The default: the preconditioned direction with a backtracking line search on the merit."""
-    search = optax.scale_by_backtracking_linesearch(max_backtracking_steps=10, slope_rtol=1e-4, decrease_factor=0.5)
-    return optax.chain(direction(), search)
+class Advance(NamedTuple):
+    """A step taken: the new variables, the optimiser's state, the decrease of the loss that the gradient promised, and
+    the share of the direction that was taken (0: none lowered the loss)."""
+
+    p: Float[Array, "p"]
+    state: optax.OptState
+    promised: Float[Array, ""]
+    taken: Float[Array, ""]
 
 
 @eqx.filter_jit
-def advance(p, state, linear: Linear, table: Table, limits: Limits, temperature, how: Integration, optimiser):
-    """One step of an optax optimiser."""
-    e, rows = linear.arrival, linear.arrival_rows
-    updates, state = optimiser.update(
-        linear.gradient,
-        state,
-        p,
-        linear=linear,
-        value=linear.loss + RESTORE * e @ e,
-        grad=linear.gradient + 2 * RESTORE * e @ rows,
-        value_fn=lambda q, linear: merit(q, table, limits, temperature, how),
-    )
-    return p + updates, state
+def advance(p, state, linear: Linear, table: Table, limits: Limits, temperature, how: Integration, optimiser) -> Advance:
+    """One step of an optax optimiser, shortened until it lowers the loss after its return to the arrival.
 
-
-@eqx.filter_jit
-def restore(p, linear: Linear, table: Table, how: Integration, steps: int = 8):
-    """Return to the arrival with the least change in the metric: Newton's method on `e` with the rows of `linear`."""
+    The return is Newton's method on the arrival error with the rows of `linear`, by least changes in its metric.
+    """
+    way, state = optimiser.update(linear.gradient, state, p, linear=linear)
     rows = linear.arrival_rows
     spread = jnp.linalg.solve(linear.metric, rows.T)
     back = spread @ jnp.linalg.inv(rows @ spread)
+    promised = -linear.gradient @ way
+    largest = jnp.abs(way[:-1]).max()
+    whole = jnp.minimum(1.0, 1.0 / jnp.maximum(largest, 1e-30))
 
-    def step(state):
-        p, _, count = state
-        e = observe(p, table, how)[3]
-        move = back @ e
-        longest = jnp.abs(move).max()
-        return p - move * jnp.minimum(1.0, 0.1 / jnp.maximum(longest, 1e-30)), jnp.abs(e).max(), count + 1
+    # Where the start is off its arrival or outside the limits, its loss is no measure for the first step.
+    held = jnp.isfinite(linear.loss)
+    comparable = jnp.abs(linear.arrival).max() < 1e-6
 
-    start = (p, jnp.asarray(jnp.inf, p.dtype), 0)
-    p, _, _ = jax.lax.while_loop(lambda s: (s[1] > 1e-11) & (s[2] < steps), step, start)
-    return p
+    def step(search):
+        q, share, returns, cuts, _ = search
+        loss, error = merit(q, table, limits, temperature, how)
+        size = jnp.abs(error).max()
+        arrived = size < ARRIVED
+        lower = jnp.isfinite(loss) & ((loss <= linear.loss + 1e-9 * jnp.abs(linear.loss)) | ~comparable) | ~held
+        lost = ~jnp.isfinite(size) | (size > 1.0) | (returns >= RETURNS) | (arrived & ~lower)
+        shorter = share * SHORTER
+        nearer = q - back @ error
+        return (
+            jnp.where(arrived & lower, q, jnp.where(lost, p + shorter * way, nearer)),
+            jnp.where(lost, shorter, share),
+            jnp.where(lost, 0, returns + 1),
+            cuts + lost,
+            arrived & lower,
+        )
+
+    begin = (p + whole * way, whole, jnp.asarray(0), jnp.asarray(0), jnp.asarray(False))
+    q, share, _, _, done = jax.lax.while_loop(lambda s: ~s[4] & (s[3] < CUTS), step, begin)
+    return Advance(jnp.where(done, q, p), state, promised, jnp.where(done, share, 0.0))

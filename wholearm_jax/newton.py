@@ -2,6 +2,7 @@
 
 The iterations run on constants; one further step, taken with the Jacobian frozen at the root, carries the derivatives:
 for `F(z, p) = 0` it returns `z - J^-1 F(z, p)`, whose derivative is `-J^-1 dF/dp`, the implicit function theorem.
+Second derivatives of the root are not carried.
 """
 
 from collections.abc import Callable
@@ -9,45 +10,46 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
 
 class Root(NamedTuple):
-    """A root, the largest remaining residual and the number of steps taken."""
+    """A root, the largest residual at the last iterate but one, and the number of steps taken."""
 
     z: Float[Array, "n"]
     residual: Float[Array, ""]
     steps: Int[Array, ""]
 
 
-def newton(function: Callable, z: Float[Array, "n"], *, steps: int = 20, longest: float = 0.3) -> Root:
-    """Find a root of `function` near `z`, each step no longer than `longest`; stops at rounding level.
+def newton(function: Callable, z: Float[Array, "n"], *parameters, steps: int = 20, longest: float = 0.3) -> Root:
+    """A root of `function(z, *parameters)` near `z`, each step no longer than `longest`, to rounding level.
 
-    `function` must not carry derivatives (see `differentiable`). A root that was not found shows in `residual`.
+    A root that was not found shows in `residual`, never as NaN or an exception.
     """
     eps = jnp.finfo(z.dtype).eps
+    fixed = stop_gradient(parameters)
+
+    def twice(z):
+        value = function(z, *fixed)
+        return value, value
 
     def step(state):
-        z, _, count, _ = state
-        jacobian = jax.jacfwd(function)(z)
-        move = -jnp.linalg.solve(jacobian, function(z))
+        z, _, _, count, _ = state
+        jacobian, value = jax.jacfwd(twice, has_aux=True)(z)
+        move = -jnp.linalg.solve(jacobian, value)
         move = jnp.where(jnp.isfinite(move), move, 0.0)
         size = jnp.abs(move).max()
         move = move * jnp.minimum(1.0, longest / jnp.maximum(size, longest * eps))
-        return z + move, jnp.abs(function(z + move)).max(), count + 1, size
+        return z + move, jacobian, jnp.abs(value).max(), count + 1, size
 
     def going(state):
-        _, residual, count, size = state
-        return (count < steps) & ((size > 4 * eps) & (residual > 0) | (count < 2))
+        _, _, residual, count, size = state
+        return (count < steps) & (size > 4 * eps) & (residual > 0)
 
-    start = (z, jnp.asarray(jnp.inf, z.dtype), jnp.asarray(0), jnp.asarray(jnp.inf, z.dtype))
-    z, residual, count, _ = jax.lax.while_loop(going, step, start)
-    return Root(z, residual, count)
-
-
-def differentiable(function: Callable, root: Float[Array, "n"], *parameters) -> Float[Array, "n"]:
-    """One Newton step from `root` that carries the derivatives of `function(z, *parameters) = 0`."""
-    root = jax.lax.stop_gradient(root)
-    frozen = jax.lax.stop_gradient(parameters)
-    jacobian = jax.jacfwd(lambda z: function(z, *frozen))(root)
-    return root - jnp.linalg.solve(jacobian, function(root, *parameters))
+    far = jnp.asarray(jnp.inf, z.dtype)
+    start = (stop_gradient(z), jnp.eye(z.shape[0], dtype=z.dtype), far, jnp.asarray(0), far)
+    z, jacobian, residual, count, _ = jax.lax.while_loop(going, step, start)
+    residual = jnp.where(jnp.isfinite(residual), residual, jnp.inf)
+    correction = jnp.linalg.solve(stop_gradient(jacobian), function(stop_gradient(z), *parameters))
+    return Root(z - jnp.where(jnp.isfinite(correction), correction, 0.0), residual, count)

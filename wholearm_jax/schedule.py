@@ -50,7 +50,7 @@ def has_steps(schedule: Torque, start: float, end: float) -> bool:
     return bool(np.any((stepped > start) & (stepped < end)))
 
 
-def padded(schedule: Torque, multiple: int = 32) -> Torque:
+def padded(schedule: Torque, multiple: int = 64) -> Torque:
     """The same schedule with its last row repeated, so that schedules of like length share a compiled program."""
     missing = -schedule.times.shape[0] % multiple
     ramp = schedule.times[-1] + (schedule.times[-1] - schedule.times[0]) * jnp.arange(1, missing + 1)

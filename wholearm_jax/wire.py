@@ -4,7 +4,7 @@ Four C-functions in five unknowns leave a wire that depends on geometry alone. I
 `s = s_ref + u . (z - z_ref)` (object units, see `system`), `u` being the unit tangent where the chart begins; a wire
 that turns away from `u` continues in a new chart, so turning points of single coordinates are nothing special. The
 search below (march, watch, bracket) runs on constants; every place that it finds is then the root of five equations
-in five unknowns, from which derivatives follow (`newton.differentiable`).
+in five unknowns, from which derivatives follow (`newton`).
 
 A wire is cut into *pieces* where a contact's slip or a joint's speed reverses, or the chart changes: within a piece
 everything is smooth. Pieces are cut into panels with Chebyshev nodes, at which `reduction` tabulates.
@@ -19,8 +19,8 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.contacts import frames, gaps, normal_rows, slip_rows
-from wholearm_jax.newton import differentiable, newton
+from wholearm_jax.contacts import frame, frames, gaps, normal_rows, slip_rows
+from wholearm_jax.newton import newton
 from wholearm_jax.scene import Heading
 from wholearm_jax.status import Status
 from wholearm_jax.system import System
@@ -34,7 +34,7 @@ class Resolution(NamedTuple):
     """Sizes of a wire's table: at most `pieces` smooth pieces, `panels` panels in all, `nodes` Chebyshev nodes each."""
 
     pieces: int = 6
-    panels: int = 32
+    panels: int = 64
     nodes: int = 8
 
 
@@ -86,12 +86,10 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     heading = eqx.tree_at(lambda h: h.until_value, heading, until)
     fixed, fixed_heading = stop_gradient(system), stop_gradient(heading)
 
-    start, residual = _project(fixed, stop_gradient(rough))
-    first_tangent = _oriented(fixed, start, fixed_heading)
-    landing = (_START, first_tangent)
-    start = differentiable(lambda z, s, r: _conditions(s, heading, z, landing[1], r)[_START], start, system, rough)
+    start, residual = _project(system, rough)
+    first_tangent = _oriented(fixed, stop_gradient(start), fixed_heading)
     march = _march(fixed, fixed_heading, stop_gradient(start), first_tangent)
-    places = _places(system, heading, fixed, fixed_heading, march, resolution)
+    places = _places(system, heading, march, resolution)
     wire = _cut(system, fixed, march, places, start, resolution)
     touching = residual < 100 * jnp.finfo(rough.dtype).eps
     direction = jnp.abs(first_tangent[heading.coordinate]) > 1e-6
@@ -107,11 +105,7 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     )
 
 
-# --- the five equations that fix a place on the wire -----------------------------------------------------------------
-
-_START = 0  # nearest to the rough start
-_SLIP, _JOINT = 1, 5  # slip of contact i, speed of joint j vanish
-_WATCH = 7  # watched values: candidate gaps, room below and above along each contact's feature, `until`
+# --- the wire's start and tangent -----------------------------------------------------------------------------------
 
 
 def tangent(system: System, z: Float[Array, "5"], hint: Float[Array, "5"]) -> Float[Array, "5"]:
@@ -130,36 +124,37 @@ def _watch(system, heading, z):
     return jnp.concatenate([pairs.gap, *room, ahead[None]]), pairs.along
 
 
-def _conditions(system, heading, z, hint, rough):
-    """All `[C_n; r]` with the fifth equations `r` that may fix a place, one row each."""
-    x = tangent(system, z, hint)
-    slip = slip_rows(system.contacts, z) @ x
-    fifth = jnp.concatenate([(x @ (z - rough))[None], slip, x[3:], _watch(system, heading, z)[0]])
-    held = jnp.broadcast_to(gaps(system.contacts, z), (fifth.shape[0], 4))
-    return jnp.concatenate([held, fifth[:, None]], axis=1)
-
-
 def _project(system, rough):
     """The wire's point nearest to the rough start: least-norm Newton steps to reach it, then Newton on nearness."""
+    fixed, far = stop_gradient(system), stop_gradient(rough)
 
     def least(z):
-        rows = normal_rows(system.contacts, z)
-        move = -jnp.linalg.pinv(rows) @ gaps(system.contacts, z)
+        rows = normal_rows(fixed.contacts, z)
+        move = -rows.T @ jnp.linalg.solve(rows @ rows.T, gaps(fixed.contacts, z))
+        move = jnp.where(jnp.isfinite(move), move, 0.0)
         return z + move * jnp.minimum(1.0, 0.3 / jnp.maximum(jnp.abs(move).max(), 1e-30))
 
-    z = jax.lax.fori_loop(0, 12, lambda _, z: least(z), rough)
-    hint = jnp.linalg.svd(normal_rows(system.contacts, z))[2][4]
-    root = newton(lambda z: _conditions(system, _NOWHERE, z, hint, rough)[_START], z)
+    z = jax.lax.fori_loop(0, 12, lambda _, z: least(z), far)
+    hint = _null(normal_rows(fixed.contacts, z))
+
+    def nearest(z, system, rough):
+        return jnp.concatenate([gaps(system.contacts, z), (tangent(system, z, hint) @ (z - rough))[None]])
+
+    root = newton(nearest, z, system, rough)
     near = jnp.where(root.residual < 1e-6, root.z, z)
-    return near, jnp.abs(gaps(system.contacts, near)).max()
+    return near, jnp.abs(gaps(fixed.contacts, stop_gradient(near))).max()
 
 
-_NOWHERE = Heading(np.asarray(0), np.asarray(1.0), np.asarray(-1), np.asarray(0.0))
+def _null(rows):
+    """A unit vector orthogonal to four rows: signed minors, the five-dimensional cross product."""
+    minors = jnp.stack([jnp.linalg.det(jnp.delete(rows, k, axis=1)) for k in range(5)])
+    minors = minors * jnp.array([1.0, -1.0, 1.0, -1.0, 1.0], rows.dtype)
+    return minors / jnp.maximum(jnp.sqrt(minors @ minors), 1e-30)
 
 
 def _oriented(system, z, heading):
     """The unit tangent at `z` whose coordinate `heading.coordinate` has the sign asked for."""
-    null = jnp.linalg.svd(normal_rows(system.contacts, z))[2][4]
+    null = _null(normal_rows(system.contacts, z))
     return null * jnp.where(null[heading.coordinate] * heading.sign < 0, -1.0, 1.0)
 
 
@@ -315,62 +310,67 @@ class _Places(NamedTuple):
     failed: Float[Array, ""]
 
 
+_PLANE, _END = 6, 7  # fifth equations: 0-3 slip of a contact, 4-5 speed of a joint, then these
+
+
 def _coordinate(march, chart, z):
     return march.anchor_s[chart] + march.charts[chart] @ (z - march.anchors[chart])
 
 
-def _places(system, heading, fixed, fixed_heading, march, resolution):
+def _fifth(system, heading, march, z, hint, plane):
+    """The equations that may fix a place on the wire beside the C-functions; the last is what ends the wire."""
+    x = tangent(system, z, hint)
+    pairs = system.candidates.lower.shape[0]
+    made = jax.tree.map(lambda a: a[jnp.clip(march.end, 0, pairs - 1)], system.candidates)
+    held = frames(system.contacts, z)
+    room = [held.along - system.contacts.lower, system.contacts.upper - held.along]
+    ahead = heading.until_value - z[heading.until_coordinate]
+    others = jnp.concatenate([*room, ahead[None]])
+    ending = jnp.where(march.end < pairs, frame(made, z).gap, others[jnp.maximum(march.end - pairs, 0)])
+    still = hint @ (z - plane)
+    return jnp.concatenate(
+        [slip_rows(system.contacts, z) @ x, x[3:], still[None], jnp.where(march.end < 0, still, ending)[None]]
+    )
+
+
+def _places(system, heading, march, resolution):
     """Sharpen the bracketed end and every sign change of slips and joint speeds to rounding level."""
+    fixed = stop_gradient(system)
     rows = jnp.arange(MAX_MARCH)
     live = rows < march.n
     reversing = jax.vmap(lambda z, x: jnp.concatenate([slip_rows(fixed.contacts, z) @ x, x[3:]]))(march.z, march.x)
     flips, share = _flips(reversing, live)
     turns = live & (rows > 0) & (march.chart != jnp.roll(march.chart, 1))
     found = jnp.concatenate([flips, turns[:, None]], axis=1)
+    share = jnp.concatenate([share, jnp.zeros((MAX_MARCH, 1), share.dtype)], axis=1)
     before = jnp.roll(march.s, 1).at[0].set(0.0)
-    key = jnp.where(found, before[:, None] + jnp.concatenate([share, jnp.zeros((MAX_MARCH, 1))], 1) * SHORTEST, jnp.inf)
-    order = jnp.argsort(key.ravel())[: resolution.pieces - 1]
-    used = jnp.isfinite(key.ravel()[order])
-    segment, what = order // 7, order % 7
+    order = jnp.argsort(jnp.where(found, before[:, None] + share * SHORTEST, jnp.inf).ravel())[: resolution.pieces - 1]
+    last = jnp.maximum(march.n - 1, 0)
+    used = jnp.append(found.ravel()[order], True)
+    segment = jnp.append(order // 7, last)
+    what = jnp.append(order % 7, _END)
+    fraction = share[segment, jnp.minimum(what, _PLANE)][:, None]
+    guess = march.z[segment - 1] * (1 - fraction) + march.z[segment] * fraction
+    guess = jnp.where(used[:, None], guess, march.z[0]).at[-1].set(march.end_z)
+    what = jnp.where(used, what, _PLANE)
 
-    def one(segment, what, used):
-        left, right = march.z[segment - 1], march.z[segment]
-        fraction = jnp.where(what < 6, share[segment, jnp.minimum(what, 5)], 0.0)
-        guess = jnp.where(used, left + fraction * (right - left), march.z[0])
+    def locate(segment, what, guess):
         hint = march.x[jnp.maximum(segment - 1, 0)]
-        chart = march.chart[segment]
-        plane = jnp.concatenate([fixed_zero, jnp.zeros(1)])
 
         def equations(z, system, heading):
-            conditions = _conditions(system, heading, z, hint, march.z[0])[_SLIP + jnp.minimum(what, 5)]
-            on_plane = jnp.concatenate([conditions[:4], (hint @ (z - stop_gradient(guess)))[None]])
-            return jnp.where(used & (what < 6), conditions, on_plane)
+            fifth = _fifth(system, heading, march, z, hint, guess)[what]
+            return jnp.concatenate([gaps(system.contacts, z), fifth[None]])
 
-        root = newton(lambda z: equations(z, fixed, fixed_heading), guess)
-        z = differentiable(equations, root.z, system, heading)
-        s = _coordinate(march, chart, z)
-        low, high = before[segment] - 1e-6, march.s[segment] + 1e-6
-        wrong = used & ((root.residual > 1e-8) | (s < low) | (s > high))
-        del plane
-        return z, jnp.where(used, s, jnp.inf), chart, wrong
+        root = newton(equations, guess, system, heading)
+        return root.z, root.residual, _coordinate(march, march.chart[segment], root.z)
 
-    fixed_zero = jnp.zeros(4)
-    z, s, chart, wrong = jax.vmap(one)(segment, what, used)
-    order = jnp.argsort(stop_gradient(s))
-
-    last = jnp.maximum(march.n - 1, 0)
-    hint = march.x[last]
-
-    def ending(z, system, heading):
-        conditions = _conditions(system, heading, z, hint, march.z[0])[_WATCH + jnp.maximum(march.end, 0)]
-        frozen = jnp.concatenate([conditions[:4], (hint @ (z - march.end_z))[None]])
-        return jnp.where(march.end >= 0, conditions, frozen)
-
-    root = newton(lambda z: ending(z, fixed, fixed_heading), march.end_z)
-    end = differentiable(ending, root.z, system, heading)
-    end_s = _coordinate(march, march.chart[last], end)
-    off = (march.end >= 0) & ((root.residual > 1e-8) | (jnp.abs(end_s - march.s[last]) > 4 * SHORTEST))
-    return _Places(z[order], s[order], chart[order], end, end_s, jnp.any(wrong) | off)
+    z, residual, s = jax.vmap(locate)(segment, what, guess)
+    slack = jnp.where(what == _END, 4 * SHORTEST, 1e-6)
+    astray = (residual > 1e-8) | (s < before[segment] - slack) | (s > march.s[segment] + slack)
+    failed = jnp.any(used & astray)
+    kinks = jnp.where(used[:-1], s[:-1], jnp.inf)
+    rank = jnp.argsort(stop_gradient(kinks))
+    return _Places(z[rank], kinks[rank], march.chart[segment[rank]], z[-1], s[-1], failed)
 
 
 def _flips(values, live):

@@ -1,0 +1,230 @@
+"""Optimise: the torque schedule of a plan with the largest compressive margin, phase by phase.
+
+Phases begin and end at rest, so each has its own problem. It starts from the quasi-static torques of an even
+rest-to-rest motion, descends (`descent`) while the temperature of the smooth margin falls, and keeps the best schedule
+whose honest simulation succeeds.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from wholearm_jax.descent import Limits, advance, linearise, pack, preconditioned, projected, unpack
+from wholearm_jax.motion import Integration
+from wholearm_jax.plan import Result, Traced, describe, outcomes, require_x64, run, trace
+from wholearm_jax.scene import Scene
+from wholearm_jax.schedule import Torque, padded
+from wholearm_jax.squeeze import Bound, bound, holds
+from wholearm_jax.status import Status
+
+HOTTEST, COLDEST, COOLING = 0.1, 2e-4, 0.5  # temperatures as shares of the bound, and the factor from one to the next
+FIRST = 0.9  # share of the torque limits that the start may use
+PATIENCE = 12  # steps without gain at the lowest temperature before a phase stops
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the descent: the loss, the margin [N] of the honest simulation and its status, the time it took."""
+
+    phase: int
+    step: int
+    temperature: float
+    loss: float
+    margin: float
+    status: Status
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Optimised:
+    """An optimised plan: the simulated `result`, for each phase its `bound` [N] and why the descent stopped.
+
+    `scene` carries the durations that were found. `history` holds every step.
+    """
+
+    scene: Scene
+    torque: Torque
+    result: Result
+    bounds: tuple[Bound, ...]
+    stopped: tuple[str, ...]
+    history: tuple[Step, ...]
+
+    @property
+    def reached(self) -> tuple[float, ...]:
+        """The share of its bound that each phase reached."""
+        return tuple(p.margin / float(b.value) for p, b in zip(self.result.phases, self.bounds, strict=True))
+
+
+def quasistatic(scene: Scene, *, knots: int = 31, traced: tuple[Traced, ...] = ()) -> Torque:
+    """The quasi-static torques: at each knot the best squeeze for an even rest-to-rest motion, in closed form.
+
+    The motion is `s = 3 u^2 - 2 u^3` of the wire's length in `u = t / duration`. As the inverse dynamics at the knots
+    only, the schedule carries the object near the wire's end, not exactly to it.
+    """
+    traced = traced or trace(scene)
+    return _joined(scene, [_start(at, p.duration, knots, 1.0) for at, p in zip(traced, scene.phases, strict=True)])
+
+
+def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...]:
+    """For each phase the certificate that no torque within limits holds it with a larger margin (see `squeeze.bound`)."""
+    traced = traced or trace(scene)
+    pairs = zip(traced, scene.phases, strict=True)
+    return tuple(_bound(at.table, p.duration, jnp.asarray(p.arrive == "rest")) for at, p in pairs)
+
+
+def optimise(
+    scene: Scene,
+    *,
+    knots: int = 31,
+    steps: int = 120,
+    rate_limit: float | None = None,
+    durations: tuple[float, float] | None = None,
+    optimiser: optax.GradientTransformation | None = None,
+    tolerance: float = 1e-3,
+    callback: Callable[[Step], None] | None = None,
+) -> Optimised:
+    """Find the torque schedule with the largest compressive margin by gradient descent through the simulation.
+
+    Every phase must arrive at rest; `knots` torques a joint, evenly spaced in time, are linear in between. The scene's
+    torque limits hold, and `rate_limit` [N m/s] if given. `durations = (shortest, longest)` lets each phase choose its
+    own. `optimiser` replaces the preconditioned descent by any optax optimiser, projected onto arrival. A phase stops
+    when its margin comes within `tolerance` of the bound or no longer improves by that share, or after `steps`.
+    `callback` sees every step. Where no torque can hold a formation, nothing is searched and the status says so.
+    """
+    require_x64()
+    traced = trace(scene)
+    tops = bounds(scene, traced=traced)
+    found, history, stopped = [], [], []
+    for index, (at, top) in enumerate(zip(traced, tops, strict=True)):
+        phase = scene.phases[index]
+        pinned = found[-1].values[-1] if rate_limit is not None and found else None
+        task = _Task(index, at, float(top.value), float(top.share), phase.duration, knots, steps, tolerance, pinned)
+        limits = _limits(task, rate_limit, durations)
+        schedule, why, taken = _optimise_phase(task, limits, optimiser, callback)
+        found.append(schedule)
+        stopped.append(why)
+        history += taken
+    lengths = [f.times[-1] for f in found]
+    phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, lengths, strict=True))
+    scene = eqx.tree_at(lambda s: s.phases, scene, phases)
+    torque = _joined(scene, [f.values for f in found])
+    result = describe(scene, torque, traced, outcomes(scene, torque, traced, Integration()))
+    return Optimised(scene, torque, result, tops, tuple(stopped), tuple(history))
+
+
+@dataclass(frozen=True)
+class _Task:
+    index: int
+    traced: Traced
+    bound: float
+    bound_share: float
+    duration: jax.Array
+    knots: int
+    steps: int
+    tolerance: float
+    pinned: jax.Array | None
+
+
+def _optimise_phase(task: _Task, limits: Limits, optimiser, callback) -> tuple[Torque, str, list[Step]]:
+    """Descend on one phase; return the best schedule (from time 0), why it stopped, and the steps taken."""
+    table, how = task.traced.table, Integration(max_steps=128, adjoint="forward")
+    if int(table.status) != Status.OK:
+        nothing = Torque(jnp.linspace(0.0, 1.0, task.knots) * task.duration, jnp.zeros((task.knots, 2)))
+        return nothing, f"the wire cannot be followed: {Status(int(table.status)).label}", []
+    values = _start(task.traced, task.duration, task.knots, FIRST)
+    if task.bound <= 0:
+        why = f"no torque within limits holds this formation at {100 * task.bound_share:.0f} % of its wire"
+        return Torque(jnp.linspace(0.0, 1.0, task.knots) * task.duration, values), why, []
+    if task.pinned is not None:
+        values = values.at[0].set(task.pinned)
+    p = pack(_within_rate(values, limits, task), jnp.asarray(task.duration), table)
+    method = _DESCENT if optimiser is None else projected(optimiser)
+    state, temperature = method.init(p), HOTTEST * task.bound
+    best, best_margin, history, since = p, -np.inf, [], 0
+    why = f"the limit of {task.steps} steps"
+    for count in range(task.steps):
+        begun = time.perf_counter()
+        linear = linearise(p, table, limits, jnp.asarray(temperature), how)
+        p, state, promised, taken = advance(p, state, linear, table, limits, jnp.asarray(temperature), how, method)
+        margin, status = _honest(p, table)
+        step = Step(task.index, count, temperature, float(linear.loss), margin, status, time.perf_counter() - begun)
+        history.append(step)
+        if callback is not None:
+            callback(step)
+        better = status is Status.OK and margin > best_margin
+        since = 0 if better and margin > best_margin + 0.1 * task.tolerance * task.bound else since + 1
+        if better:
+            best, best_margin = p, margin
+        if best_margin >= (1 - task.tolerance) * task.bound:
+            why = f"within {task.tolerance:g} of the bound"
+            break
+        coldest = temperature <= COLDEST * task.bound
+        if coldest and (since >= PATIENCE or taken == 0):
+            why = "the margin no longer improves"
+            break
+        if promised < temperature or taken == 0:
+            temperature = max(temperature * COOLING, COLDEST * task.bound)
+    return unpack(best, table)[0], why, history
+
+
+def _honest(p, table) -> tuple[float, Status]:
+    schedule, duration = unpack(p, table)
+    outcome = run(table, padded(schedule), jnp.zeros(()), duration, Integration(), True)
+    return float(outcome.score.margin), Status(int(outcome.verdict.status))
+
+
+def _start(traced: Traced, duration, knots: int, share: float):
+    """Torques at the knots that give the even rest-to-rest motion with the best squeeze."""
+    table = traced.table
+    tight = eqx.tree_at(lambda t: t.torque_limit, table, share * table.torque_limit)
+    u = jnp.linspace(0.0, 1.0, knots)
+    s = table.breaks[0] + table.length * (3 * u**2 - 2 * u**3)
+    v = table.length * 6 * (u - u**2) / duration
+    a = table.length * (6 - 12 * u) / duration**2
+    return jnp.clip(_holds(tight, s, v, a).torque, -tight.torque_limit, tight.torque_limit)
+
+
+_DESCENT = preconditioned()
+_holds = jax.jit(holds)
+_bound = jax.jit(bound)
+
+
+def _limits(task: _Task, rate_limit, durations) -> Limits:
+    shortest, longest = durations or (float(task.duration), float(task.duration))
+    rate = jnp.full(2, jnp.inf if rate_limit is None else float(rate_limit))
+    pinned = jnp.zeros(task.knots, bool).at[0].set(task.pinned is not None)
+    return Limits(rate, jnp.asarray(float(shortest)), jnp.asarray(float(longest)), pinned)
+
+
+def _within_rate(values, limits: Limits, task: _Task):
+    """The nearest knots, taken in order, that keep 90 % of the rate limit."""
+    largest = 0.9 * np.asarray(limits.rate) * float(task.duration) / (task.knots - 1)
+    if not np.all(np.isfinite(largest)):
+        return values
+    rows = [np.asarray(values[0])]
+    for row in np.asarray(values[1:]):
+        rows.append(np.clip(row, rows[-1] - largest, rows[-1] + largest))
+    return jnp.asarray(np.stack(rows))
+
+
+def _joined(scene: Scene, blocks) -> Torque:
+    """Knots of each phase as one schedule; a step where one phase follows another."""
+    start, times = 0.0, []
+    for phase, block in zip(scene.phases, blocks, strict=True):
+        end = start + float(phase.duration)
+        times.append(np.linspace(start, end, block.shape[0]))
+        start = end
+    return Torque(jnp.asarray(np.concatenate(times)), jnp.concatenate([jnp.asarray(b) for b in blocks]))
+
+
+def replace_duration(phase, duration):
+    """A phase with another duration."""
+    return eqx.tree_at(lambda p: p.duration, phase, jnp.asarray(duration, float))
+
+

@@ -1,0 +1,296 @@
+"""Plans: trace and simulate a scene's phases one after the other, and say what became of them.
+
+Each phase starts at rest where the wire of the phase before it ended. Two compiled programs serve every phase of every
+scene: `prepare` (trace and reduce) and `run` (simulate, score, judge).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from wholearm_jax.margin import Score, arcs, force, on_arc, score
+from wholearm_jax.motion import Integration, Motion, move
+from wholearm_jax.reduction import Table, horner, powers, reduce_wire
+from wholearm_jax.scene import Phase, Scene, body, contact_name
+from wholearm_jax.schedule import Torque, has_steps, padded, window
+from wholearm_jax.status import Status
+from wholearm_jax.system import system
+from wholearm_jax.verdict import Verdict, judge
+from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
+
+
+class Traced(NamedTuple):
+    """A phase's wire and its table."""
+
+    wire: Wire
+    table: Table
+
+
+class Outcome(NamedTuple):
+    """A simulated phase as arrays."""
+
+    motion: Motion
+    score: Score
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class PhaseResult:
+    """A simulated phase, readable: times in seconds from the plan's start, contacts by name, forces in newtons."""
+
+    name: str
+    contacts: tuple[str, ...]
+    status: Status
+    time: float
+    contact: str | None
+    start: float
+    duration: float
+    margin: float
+    margin_time: float
+    margin_s: float
+    margin_contact: str
+    traced: Traced
+    outcome: Outcome
+
+    @property
+    def message(self) -> str:
+        """One line: which phase, what, which contact, when."""
+        if self.status is Status.OK:
+            return f"{self.name}: ok, margin {self.margin:.4g} N at {self.margin_contact}, t = {self.margin_time:.4g} s"
+        whose = f" at {self.contact}" if self.contact else ""
+        return f"{self.name}: {self.status.label}{whose}, t = {self.time:.6g} s: {self.status.advice}"
+
+
+@dataclass(frozen=True)
+class Result:
+    """A simulated plan. `margin` [N] is the least over its phases; `status` that of the first phase that is not ok."""
+
+    scene: Scene
+    torque: Torque
+    phases: tuple[PhaseResult, ...]
+
+    @property
+    def status(self) -> Status:
+        return next((p.status for p in self.phases if p.status is not Status.OK), Status.OK)
+
+    @property
+    def margin(self) -> float:
+        return min(p.margin for p in self.phases)
+
+    @property
+    def message(self) -> str:
+        """What became of the plan, in one line."""
+        return next((p.message for p in self.phases if p.status is not Status.OK), "ok, margin %.4g N" % self.margin)
+
+
+@eqx.filter_jit
+def prepare(scene_body, hand, gravity, formation, rough, heading, resolution: Resolution = Resolution()) -> Traced:
+    """Trace a formation's wire from a rough start (SI) and tabulate its reduced dynamics."""
+    mechanics = system(scene_body, hand, gravity, formation)
+    wire = trace_wire(mechanics, rough, heading, resolution)
+    return Traced(wire, reduce_wire(mechanics, wire))
+
+
+@eqx.filter_jit
+def run(table: Table, schedule: Torque, start, duration, how: Integration, at_rest: bool) -> Outcome:
+    """Simulate one phase from rest at its wire's start, score it and judge it."""
+    seen = window(schedule, start, duration)
+    motion = move(table, seen, duration, how=how)
+    scored = score(table, seen, duration, motion)
+    return Outcome(motion, scored, judge(table, motion, scored, at_rest))
+
+
+def end_configuration(traced: Traced) -> Float[Array, "5"]:
+    """`z` (SI) where a wire ends."""
+    table = traced.table
+    panel, xi = powers(table, table.count - 1, table.breaks[-1])
+    return horner(table.configuration[panel], xi)
+
+
+def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: float = 1e-9) -> tuple[Traced, ...]:
+    """Trace and tabulate every phase of a plan.
+
+    The table of a phase is refined (panels doubled, up to 512) until its interpolation error, relative to each
+    function's size, is below `tolerance`; pieces are added likewise. What cannot be traced says so in
+    `Traced.table.status`, and what follows it cannot be trusted.
+    """
+    solid, rough, found = body(scene.object), scene.start, []
+    for phase in scene.phases:
+        traced = _refined(solid, scene, phase, rough, resolution, tolerance)
+        found.append(traced)
+        rough = end_configuration(traced)
+    return tuple(found)
+
+
+def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, tolerance: float) -> Traced:
+    while True:
+        traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, resolution)
+        table = traced.table
+        if isinstance(table.error, jax.core.Tracer):
+            return traced  # under a transformation shapes are fixed: the caller has chosen the resolution
+        coarse = bool(table.error > tolerance) and int(table.status) == Status.OK
+        full = int(table.count) >= resolution.pieces
+        if full and resolution.pieces < 48:
+            resolution = resolution._replace(pieces=2 * resolution.pieces, panels=2 * resolution.panels)
+        elif coarse and resolution.panels < 512:
+            resolution = resolution._replace(panels=2 * resolution.panels)
+        elif coarse or full:
+            return eqx.tree_at(lambda t: t.table.status, traced, jnp.asarray(int(Status.NO_CONVERGENCE)))
+        else:
+            return traced
+
+
+def outcomes(scene: Scene, torque: Torque, traced: tuple[Traced, ...], how: Integration) -> tuple[Outcome, ...]:
+    """Simulate every phase; differentiable, and usable under any JAX transformation."""
+    schedule, start, found = padded(torque), jnp.zeros((), torque.times.dtype), []
+    for phase, at in zip(scene.phases, traced, strict=True):
+        found.append(run(at.table, schedule, start, phase.duration, how, phase.arrive == "rest"))
+        start = start + phase.duration
+    return tuple(found)
+
+
+def margin(
+    scene: Scene, torque: Torque, *, how: Integration = Integration(), resolution: Resolution = Resolution()
+) -> Float[Array, ""]:
+    """The compressive margin [N] of a plan: the least `c_n` over time and contacts, formations assumed to hold.
+
+    Differentiable, in forward and reverse mode, with respect to the torques and every float of the scene; negative
+    where a contact would pull; `-inf` where a phase has no motion to score. Whether the plan succeeds is for
+    `simulate` to say.
+    """
+    found = outcomes(scene, torque, trace(scene, resolution=resolution), how)
+    return jnp.stack([jnp.where(jnp.isfinite(o.score.margin), o.score.margin, -jnp.inf) for o in found]).min()
+
+
+def simulate(
+    scene: Scene, torque: Torque, *, tolerance: float = 1e-10, max_steps: int = 256, traced: tuple[Traced, ...] = ()
+) -> Result:
+    """Simulate a plan under a torque schedule and judge it.
+
+    `tolerance` is the integrator's; `traced` reuses the result of `trace`. Raises ValueError for a schedule that is
+    shorter than the plan; everything else is a status.
+    """
+    require_x64()
+    total = sum(float(p.duration) for p in scene.phases)
+    last = float(torque.times[-1])
+    if float(torque.times[0]) > 0 or last < total * (1 - 1e-9):
+        raise ValueError(f"the torque schedule covers {float(torque.times[0]):g} to {last:g} s, the plan 0 to {total:g} s")
+    traced = traced or trace(scene)
+    stepped = any(has_steps(torque, start, end) for start, end in _spans(scene))
+    while True:
+        how = Integration(tolerance=tolerance, max_steps=max_steps, steps=stepped)
+        found = outcomes(scene, torque, traced, how)
+        short = any(int(o.verdict.status) == Status.MAX_STEPS for o in found)
+        if not short or max_steps >= 16384:
+            return describe(scene, torque, traced, found)
+        max_steps *= 4
+
+
+def describe(scene: Scene, torque: Torque, traced, found) -> Result:
+    """Arrays as a readable result."""
+    rows = []
+    for phase, (start, _), at, outcome in zip(scene.phases, _spans(scene), traced, found, strict=True):
+        names, length = phase.formation.names, float(phase.duration)
+        verdict, scored = outcome.verdict, outcome.score
+        contact = int(verdict.contact)
+        known = bool(np.isfinite(scored.margin)) and int(at.table.status) == Status.OK
+        rows.append(
+            PhaseResult(
+                name=phase.name,
+                contacts=names,
+                status=Status(int(verdict.status)),
+                time=start + length * float(verdict.share),
+                contact=names[contact] if contact >= 0 else None,
+                start=start,
+                duration=length,
+                margin=float(scored.margin) if known else float("-inf"),
+                margin_time=start + length * float(scored.share),
+                margin_s=float(scored.s),
+                margin_contact=names[int(scored.contact)],
+                traced=at,
+                outcome=outcome,
+            )
+        )
+    return Result(scene, torque, tuple(rows))
+
+
+def _spans(scene: Scene):
+    """Start and end time of every phase."""
+    ends = np.cumsum([float(p.duration) for p in scene.phases])
+    return [(float(end) - float(p.duration), float(end)) for end, p in zip(ends, scene.phases, strict=True)]
+
+
+def ending(traced: Traced, phase: Phase, capacity: int) -> str:
+    """Why a wire ends, in words."""
+    why, index = int(traced.wire.end_why), int(traced.wire.end_contact)
+    if why == MADE:
+        group, feature = divmod(index, capacity)
+        link, kind = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1))[group]
+        return f"{contact_name(link, kind, feature)} is made"
+    if why == LEFT:
+        return f"{phase.formation.names[index]} leaves its feature"
+    return "the phase's own limit is reached" if why == UNTIL else "no end was found"
+
+
+class Trajectory(NamedTuple):
+    """A phase sampled in time, SI units; `cn` and `ct` are NaN while friction holds the object at rest."""
+
+    time: Float[Array, "samples"]
+    s: Float[Array, "samples"]
+    z: Float[Array, "samples 5"]
+    z_dot: Float[Array, "samples 5"]
+    torque: Float[Array, "samples 2"]
+    cn: Float[Array, "samples contacts"]
+    ct: Float[Array, "samples contacts"]
+
+
+@eqx.filter_jit
+def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shares) -> Trajectory:
+    """A phase's motion at given shares of its duration; beyond its end the object rests there."""
+    seen = window(schedule, start, duration)
+    steps = arcs(table, seen, duration, motion)
+
+    def one(share):
+        k = jnp.clip((share >= motion.share).sum() - 1, 0, jnp.maximum(motion.count - 1, 0))
+        arc = jax.tree.map(lambda a: a[k], steps)
+        width = arc.share[1] - arc.share[0]
+        xi = jnp.clip((share - arc.share[0]) / jnp.where(width > 0, width, 1.0), 0.0, 1.0)
+        _, s, w = on_arc(arc, xi)
+        over = share > motion.share[motion.count] + 1e-12
+        w = jnp.where(over, 0.0, w)
+        panel, at = powers(table, arc.piece, s)
+        cn = force(table, seen, duration, arc.piece, arc.row, share, s, w)
+        cn = jnp.where(arc.held | over, jnp.nan, cn)
+        tau = seen.values[arc.row] + seen.slope[arc.row] * (share - seen.share[arc.row])
+        z_dot = horner(table.velocity[panel], at) * w / duration
+        return s, horner(table.configuration[panel], at), z_dot, tau, cn, cn * table.tension[arc.piece]
+
+    return Trajectory(start + duration * shares, *jax.vmap(one)(shares))
+
+
+def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
+    """Every phase at `samples` evenly spaced times; a phase that failed stops at its failure, later ones are left out."""
+    found, schedule = [], padded(result.torque)
+    for phase in result.phases:
+        if int(phase.traced.table.status) != Status.OK:
+            break
+        stop = 1.0 if phase.status is Status.OK else (phase.time - phase.start) / phase.duration
+        shares = jnp.linspace(0.0, stop, samples)
+        start, duration = jnp.asarray(phase.start), jnp.asarray(phase.duration)
+        found.append(sample(phase.traced.table, schedule, start, duration, phase.outcome.motion, shares))
+        if phase.status is not Status.OK:
+            break
+    return tuple(found)
+
+
+def require_x64() -> None:
+    """Raise unless JAX computes in 64 bits: the statuses' tolerances need them."""
+    if not jax.config.jax_enable_x64:
+        raise RuntimeError(
+            "this function needs float64; call jax.config.update('jax_enable_x64', True) before importing arrays"
+        )

@@ -1,0 +1,52 @@
+"""Judge: what became of a simulated phase, from its motion and its score."""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from wholearm_jax.margin import Score
+from wholearm_jax.motion import Motion
+from wholearm_jax.reduction import Table
+from wholearm_jax.status import Status
+
+ARRIVAL = 1e-6  # of the wire's length: how near its end a phase that arrives at rest must come
+ARRIVAL_SPEED = math.sqrt(12 * ARRIVAL)
+"""Speed left at arrival, in wire lengths a duration: what braking at 6 lengths a duration squared (the even
+rest-to-rest motion) ends within `ARRIVAL` of a length. Nearer to the end time and position do not fix the speed better
+than this square root."""
+
+
+class Verdict(eqx.Module):
+    """A phase's `status`, when as a share of its duration, and the contact concerned (-1: none)."""
+
+    status: Int[Array, ""]
+    share: Float[Array, ""]
+    contact: Int[Array, ""]
+
+
+def judge(table: Table, motion: Motion, score: Score, at_rest: bool) -> Verdict:
+    """Decide the status of a phase that must end at rest (`at_rest`) or may end moving.
+
+    The earliest trouble counts: a wire that cannot be traced, a tensile force, then how the motion ended.
+    """
+    share, s, w = (values[motion.count] for values in (motion.share, motion.s, motion.w))
+    near = jnp.abs(table.breaks[-1] - s) <= ARRIVAL * table.length
+    slow = w <= ARRIVAL_SPEED * table.length
+    late = share >= 1 - ARRIVAL_SPEED
+    ended = motion.status
+    if at_rest:
+        held = (ended == Status.STUCK) | ((ended == Status.REVERSED) & late) | (ended == Status.LEFT_FORMATION)
+        arrived = near & slow & (held | (ended == Status.OK))
+    else:
+        arrived = near & ((ended == Status.LEFT_FORMATION) | (ended == Status.OK))
+    finish = jnp.where(arrived, int(Status.OK), jnp.where(ended == Status.OK, int(Status.NOT_REACHED), ended))
+    lost = jnp.isfinite(score.lost)
+    status = jnp.where(lost, int(Status.CONTACT_LOST), finish)
+    traced = table.status == 0
+    return Verdict(
+        status=jnp.where(traced, status, table.status),
+        share=jnp.where(traced, jnp.where(lost, score.lost, share), 0.0),
+        contact=jnp.where(traced & lost, score.lost_contact, -1),
+    )
