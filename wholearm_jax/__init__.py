@@ -1,0 +1,38 @@
+"""Differentiable dynamics and torque-trajectory optimisation for planar whole-arm manipulation.
+
+Read the modules in this order: `scene`, `contacts`, `system`, `wire` (trace), `reduction` (reduce), `schedule`,
+`motion` (simulate), `margin` (score), `verdict`, `plan`, `squeeze` (quasi-static torques and the bound), `descent` and
+`optimiser` (optimise), `baseline` (the paper's search).
+"""
+
+from wholearm_jax.baseline import search
+from wholearm_jax.motion import Integration
+from wholearm_jax.optimiser import bounds, optimise, quasistatic
+from wholearm_jax.plan import margin, simulate, trace, trajectory
+from wholearm_jax.result_file import read_torque, write_torque
+from wholearm_jax.scene import Scene
+from wholearm_jax.scene_file import SceneError, load, parse, save
+from wholearm_jax.schedule import Torque, torque
+from wholearm_jax.status import Status
+
+__all__ = [
+    "Integration",
+    "Scene",
+    "SceneError",
+    "Status",
+    "Torque",
+    "bounds",
+    "load",
+    "margin",
+    "optimise",
+    "parse",
+    "quasistatic",
+    "read_torque",
+    "save",
+    "search",
+    "simulate",
+    "torque",
+    "trace",
+    "trajectory",
+    "write_torque",
+]

@@ -1,0 +1,107 @@
+"""The paper's own way to torques (section 3.1): steps of ten per cent. Kept as an honest baseline, nothing more.
+
+For each phase both joints first get the constant torques that would hold the object still with the best squeeze, within
+a share of their limits (a few shares are tried, since the paper only says that it knew how much to begin with). Then
+the torque of the pushing finger is raised by 10 % until the object begins to move, raised on while every contact stays
+compressive, and lowered by 10 % when a contact opens; the last torque that works is recorded. Each phase therefore
+begins with a step in the torque, and ends as soon as its wire does, at whatever speed: a phase of the search arrives
+`moving`, and the next is taken to start from rest.
+"""
+
+import time
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from wholearm_jax.motion import Integration
+from wholearm_jax.optimiser import replace_duration
+from wholearm_jax.plan import Result, Traced, require_x64, run, simulate, trace
+from wholearm_jax.scene import Phase, Scene
+from wholearm_jax.schedule import Torque, padded
+from wholearm_jax.squeeze import coefficients, hold
+from wholearm_jax.status import Status
+
+STEP = 1.1
+HOLDS = tuple(STEP**-k for k in range(26, 0, -1))  # shares of the torque limits within which a series may begin
+MOST = 60  # raises a series before the search gives up
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What the search found: the scene with the durations that came out, the schedule, its simulation and the cost."""
+
+    scene: Scene
+    torque: Torque
+    result: Result
+    simulations: int
+    seconds: float
+
+
+def search(scene: Scene, *, longest: float = 10.0) -> Searched:
+    """Search each phase's torques by steps of 10 %; no phase may take longer than `longest` seconds.
+
+    A phase for which no raise works keeps the attempt with the largest margin, and the result's status says what it
+    does.
+    """
+    require_x64()
+    begun = time.perf_counter()
+    traced = trace(scene)
+    phases, times, rows, start, count = [], [], [], 0.0, 0
+    for phase, at in zip(scene.phases, traced, strict=True):
+        torque, duration, tried = _search_phase(at, longest)
+        count += tried
+        phases.append(_arriving(replace_duration(phase, duration)))
+        times += [start, start + duration]
+        rows += [torque, torque]
+        start += duration
+    found = eqx.tree_at(lambda s: s.phases, scene, tuple(phases))
+    schedule = Torque(jnp.asarray(times), jnp.asarray(np.array(rows)))
+    result = simulate(found, schedule, traced=traced)
+    return Searched(found, schedule, result, count + len(phases), time.perf_counter() - begun)
+
+
+def _arriving(phase: Phase) -> Phase:
+    return Phase(phase.name, phase.formation, phase.heading, phase.duration, arrive="moving")
+
+
+def _search_phase(at: Traced, longest: float) -> tuple[np.ndarray, float, int]:
+    """Torques, the time the wire takes under them, and the number of simulations."""
+    if int(at.table.status) != Status.OK:
+        return np.zeros(2), 1.0, 0
+    series = [_raise(at.table, share, longest) for share in HOLDS]
+    count = sum(tried for *_, tried in series)
+    torque, duration, _, _ = max(series, key=lambda one: (one[2] is Status.OK, one[3]))[:4]
+    return torque, duration, count
+
+
+def _raise(table, share: float, longest: float) -> tuple[np.ndarray, float, Status, float, int]:
+    """One series of raises from the best hold within a share of the torque limits: the last that worked, if one did."""
+    limit = np.asarray(table.torque_limit)
+    tight = eqx.tree_at(lambda t: t.torque_limit, table, share * table.torque_limit)
+    torque = np.asarray(_hold(tight, table.breaks[0]).torque)
+    pull = np.asarray(_coefficients(table, table.breaks[0])[0])[3:]
+    # The pushing finger is the one whose torque, raised in its own direction, accelerates the object more.
+    pushing = int(np.argmax(pull * np.sign(torque)))
+    kept = None
+    for count in range(1, MOST + 1):
+        status, margin, end = _attempt(table, torque, longest)
+        if kept is None or (status is Status.OK, margin) > (kept[2] is Status.OK, -np.inf):
+            kept = (torque, end, status, margin)
+        opened = status is Status.CONTACT_LOST and kept[2] is Status.OK
+        torque = np.where(np.arange(2) == pushing, STEP * torque, torque)
+        if opened or abs(torque[pushing]) > limit[pushing]:
+            break  # a contact opened: back by 10 %, which is the last one that worked
+    return *kept, count
+
+
+_hold, _coefficients = eqx.filter_jit(hold), eqx.filter_jit(coefficients)
+
+
+def _attempt(table, torque, longest) -> tuple[Status, float, float]:
+    """One simulation under constant torques: status, margin and the time at which it ended."""
+    schedule = padded(Torque(jnp.asarray([0.0, longest]), jnp.asarray(np.stack([torque, torque]))))
+    outcome = run(table, schedule, jnp.zeros(()), jnp.asarray(longest), Integration(), False)
+    end = float(outcome.motion.share[int(outcome.motion.count)]) * longest
+    return Status(int(outcome.verdict.status)), float(outcome.score.margin), max(end, 1e-6)

@@ -1,0 +1,227 @@
+"""The command line: `wholearm optimise`, `simulate`, `search`, `scenes`.
+
+Exit status 0 when the result is `ok`, 1 when the plan fails (its status is printed), 2 for bad input, in one line.
+"""
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import typer
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+SceneName = Annotated[str, typer.Argument(help="A bundled scene's name, or the path of a scene file.")]
+Out = Annotated[Path | None, typer.Option(help="Folder for torque.csv, trajectory.csv, summary.json and figures.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="PHASE.duration=SECONDS; PHASE is a name or a number from 0. May be repeated."),
+]
+Samples = Annotated[int, typer.Option(min=2, help="Rows a phase in trajectory.csv.")]
+
+
+class _BadInput(Exception):
+    """What the user gave cannot be used; the message is one line."""
+
+
+def main() -> None:
+    """Run the command line."""
+    jax.config.update("jax_enable_x64", True)
+    _keep_compiled()
+    from wholearm_jax.scene_file import SceneError
+
+    try:
+        app()
+    except (SceneError, _BadInput) as error:
+        print(f"wholearm: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _keep_compiled() -> None:
+    """Keep compiled programs in the user's cache folder, unless JAX has been told otherwise."""
+    if jax.config.jax_compilation_cache_dir is not None or "JAX_ENABLE_COMPILATION_CACHE" in os.environ:
+        return
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    jax.config.update("jax_compilation_cache_dir", os.path.join(home, "wholearm_jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+@app.command()
+def scenes() -> None:
+    """List the bundled scenes."""
+    from wholearm_jax.scene_file import bundled, load
+
+    for name in bundled():
+        scene = load(name)
+        print(f"{name}: {scene.title}; " + ", ".join(phase.name for phase in scene.phases))
+
+
+@app.command()
+def optimise(
+    scene: SceneName,
+    out: Out = None,
+    set_: Changes = None,
+    knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase.")] = 31,
+    steps: Annotated[int, typer.Option(min=1, help="Most steps of descent a phase.")] = 120,
+    rate_limit: Annotated[float | None, typer.Option(min=0.0, help="Largest torque rate [N m/s].")] = None,
+    samples: Samples = 201,
+) -> None:
+    """Find the torques with the largest compressive margin, and check them by simulation."""
+    loaded = _scene(scene, set_)
+    folder = _folder(out)
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from wholearm_jax.optimiser import optimise as find
+
+    begun = time.perf_counter()
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        bars = [progress.add_task(p.name, total=steps, state="waiting") for p in loaded.phases]
+
+        def show(step):
+            state = f"margin {step.margin:.4f} N, {step.status.label}"
+            progress.update(bars[step.phase], completed=step.step + 1, state=state)
+
+        progress.update(bars[0], state="compiling")
+        found = find(loaded, knots=knots, steps=steps, rate_limit=rate_limit, callback=show)
+        for bar, why in zip(bars, found.stopped, strict=True):
+            progress.update(bar, completed=steps, state=why)
+    seconds = time.perf_counter() - begun
+    for phase, top, share, why in zip(found.result.phases, found.bounds, found.reached, found.stopped, strict=True):
+        print(f"{phase.message}; bound {float(top.value):.4g} N, {100 * share:.1f} % of it reached; stopped: {why}")
+    more = {"command": "optimise", "knots": knots, "steps": len(found.history), "seconds": seconds}
+    more |= {"rate_limit": rate_limit, "stopped": list(found.stopped)}
+    _finish(found.result, folder, samples, bounds=tuple(float(b.value) for b in found.bounds), **more)
+
+
+@app.command()
+def simulate(
+    scene: SceneName,
+    torque: Annotated[Path, typer.Option(help="Torque schedule, CSV with the header t,tau1,tau2.")],
+    out: Out = None,
+    set_: Changes = None,
+    samples: Samples = 201,
+    tolerance: Annotated[float, typer.Option(min=1e-13, max=1e-3, help="The integrator's tolerance.")] = 1e-10,
+) -> None:
+    """Simulate a plan under a given torque schedule."""
+    loaded = _scene(scene, set_)
+    from wholearm_jax.optimiser import bounds
+    from wholearm_jax.plan import simulate as follow
+    from wholearm_jax.plan import trace
+    from wholearm_jax.result_file import read_torque
+
+    schedule = read_torque(torque)
+    folder = _folder(out)
+    traced = trace(loaded)
+    try:
+        result = follow(loaded, schedule, tolerance=tolerance, traced=traced)
+    except ValueError as error:
+        raise _BadInput(f"{torque}: {error}") from None
+    for phase in result.phases:
+        print(phase.message)
+    tops = tuple(float(b.value) for b in bounds(loaded, traced=traced))
+    _finish(result, folder, samples, bounds=tops, command="simulate", torque=str(torque), tolerance=tolerance)
+
+
+@app.command()
+def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
+    """The paper's search for torques by steps of 10 %."""
+    loaded = _scene(scene, None)
+    folder = _folder(out)
+    from wholearm_jax.baseline import search as look
+
+    found = look(loaded)
+    for phase in found.result.phases:
+        print(phase.message)
+    print(f"{found.simulations} simulations in {found.seconds:.2f} s")
+    _finish(
+        found.result, folder, samples, command="search", simulations=found.simulations, seconds=found.seconds
+    )
+
+
+def _scene(name: str, changes: list[str] | None):
+    """Load a scene, apply `--set`, and refuse a start at which its contacts cannot all touch."""
+    from wholearm_jax.scene_file import load
+
+    scene = load(name)
+    for change in changes or ():
+        scene = _changed(scene, change)
+    return scene
+
+
+def _changed(scene, change: str):
+    import equinox as eqx
+
+    from wholearm_jax.optimiser import replace_duration
+
+    key, _, value = change.partition("=")
+    phase, _, field = key.rpartition(".")
+    names = [p.name for p in scene.phases]
+    row = names.index(phase) if phase in names else int(phase) if phase.isdigit() and int(phase) < len(names) else None
+    if field != "duration" or row is None:
+        raise _BadInput(f"--set {change}: write PHASE.duration=SECONDS; phases: {', '.join(names)}")
+    try:
+        seconds = float(value)
+    except ValueError:
+        seconds = float("nan")
+    if not 0 < seconds < float("inf"):
+        raise _BadInput(f"--set {change}: a duration is a positive number of seconds")
+    phases = tuple(replace_duration(p, seconds) if k == row else p for k, p in enumerate(scene.phases))
+    return eqx.tree_at(lambda s: s.phases, scene, phases)
+
+
+def _folder(out: Path | None) -> Path | None:
+    """Make the output folder now, so that a long computation is not lost to a folder that cannot be written."""
+    if out is None:
+        return None
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".wholearm"
+        probe.write_text("")
+        probe.unlink()
+    except OSError as error:
+        raise _BadInput(f"--out {out}: cannot be written: {error.strerror}") from None
+    return out
+
+
+def _finish(result, folder: Path | None, samples: int, **more) -> None:
+    """Write the files, say what became of the plan, and exit with its status."""
+    if folder is not None:
+        from wholearm_jax.result_file import summary, write_summary, write_torque, write_trajectory
+
+        try:
+            write_torque(result.torque, folder / "torque.csv")
+            write_trajectory(result, folder / "trajectory.csv", samples)
+            write_summary(summary(result, **more), folder / "summary.json")
+            _draw(result, folder)
+        except OSError as error:
+            raise _BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
+    print(result.message if not folder else f"{result.message} -> {folder}")
+    sys.exit(0 if result.status.value == 0 else 1)
+
+
+def _draw(result, folder: Path) -> None:
+    import io
+
+    import matplotlib
+
+    matplotlib.use("agg")
+    from wholearm_jax.drawing import draw_result, draw_strip
+    from wholearm_jax.writing import write_whole
+
+    figures = {"plan": draw_strip, "result": draw_result}
+    for name, draw in figures.items():
+        figure = draw(result)
+        for kind in ("png", "svg"):
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format=kind, dpi=150, bbox_inches="tight")
+            write_whole(folder / f"{name}.{kind}", buffer.getvalue())
+        matplotlib.pyplot.close(figure)
+
+
+if __name__ == "__main__":
+    main()

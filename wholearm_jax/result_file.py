@@ -1,0 +1,119 @@
+"""Result files: torque schedules and trajectories as CSV, summaries as JSON."""
+
+import csv
+import io
+import json
+import math
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wholearm_jax.plan import Result, trajectory
+from wholearm_jax.scene import COORDINATES
+from wholearm_jax.scene_file import CONSTRAINTS, SceneError, to_dict
+from wholearm_jax.schedule import Torque, torque
+from wholearm_jax.writing import write_whole
+
+TORQUE_COLUMNS = ("t", "tau1", "tau2")
+_CONTACTS = range(1, CONSTRAINTS + 1)
+TRAJECTORY_COLUMNS = (
+    *("t", "phase", *COORDINATES, *(f"{c}_dot" for c in COORDINATES), "tau1", "tau2"),
+    *(f"cn{k}" for k in _CONTACTS),
+    *(f"ct{k}" for k in _CONTACTS),
+)
+
+
+def read_torque(path: str | Path) -> Torque:
+    """Read a torque schedule (header `t,tau1,tau2`). Raises `SceneError` naming the file, the line and the cause."""
+    try:
+        with open(path, newline="") as file:
+            rows = list(csv.reader(file))
+    except FileNotFoundError:
+        raise SceneError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if not rows:
+        raise SceneError(f"{path}: the file is empty; it needs the header t,tau1,tau2 and at least two rows")
+    header = [name.strip() for name in rows[0]]
+    missing = [name for name in TORQUE_COLUMNS if name not in header]
+    if missing:
+        raise SceneError(f"{path}: line 1: missing column {', '.join(missing)}; the header is t,tau1,tau2")
+    places = [header.index(name) for name in TORQUE_COLUMNS]
+    numbers = []
+    for line, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        try:
+            values = [float(row[place]) for place in places]
+        except (ValueError, IndexError):
+            raise SceneError(f"{path}: line {line}: not three numbers: {','.join(row)}") from None
+        if not all(map(math.isfinite, values)):
+            raise SceneError(f"{path}: line {line}: not finite: {','.join(row)}")
+        if numbers and values[0] < numbers[-1][0]:
+            raise SceneError(f"{path}: line {line}: t = {values[0]:g} follows {numbers[-1][0]:g}: times must not decrease")
+        numbers.append(values)
+    table = np.asarray(numbers).reshape(-1, 3)
+    try:
+        return torque(table[:, 0], table[:, 1:])
+    except ValueError as error:
+        raise SceneError(f"{path}: {error}") from None
+
+
+def write_torque(schedule: Torque, path: str | Path) -> None:
+    """Write a torque schedule with every digit."""
+    table = np.column_stack([np.asarray(schedule.times), np.asarray(schedule.values)])
+    write_whole(path, _csv(TORQUE_COLUMNS, table.tolist()))
+
+
+def write_trajectory(result: Result, path: str | Path, samples: int = 201) -> None:
+    """Write every phase at `samples` times; forces are empty where friction holds the object at rest."""
+    rows = []
+    for phase, course in zip(result.phases, trajectory(result, samples), strict=False):
+        blocks = (course.z, course.z_dot, course.torque, course.cn, course.ct)
+        for k, time in enumerate(np.asarray(course.time)):
+            numbers = [v for block in blocks for v in np.asarray(block)[k].tolist()]
+            rows.append([float(time), phase.name, *("" if math.isnan(v) else v for v in numbers)])
+    write_whole(path, _csv(TRAJECTORY_COLUMNS, rows))
+
+
+def summary(result: Result, *, bounds: tuple[float, ...] | None = None, **more: Any) -> dict[str, Any]:
+    """What became of a plan, as the summary file holds it, with the scene to run it again."""
+    phases = []
+    for k, phase in enumerate(result.phases):
+        row = {
+            "name": phase.name,
+            "contacts": list(phase.contacts),
+            "status": phase.status.label,
+            "time": phase.time,
+            "contact": phase.contact,
+            "duration": phase.duration,
+            "margin": phase.margin,
+            "margin_time": phase.margin_time,
+            "margin_contact": phase.margin_contact,
+            "bound": None if bounds is None else bounds[k],
+            "message": phase.message,
+        }
+        phases.append(_plain(row))
+    head = {"status": result.status.label, "margin": result.margin, "message": result.message}
+    again = {"scene": to_dict(result.scene), "version": version("wholearm_jax")}
+    return _plain(head) | {"phases": phases} | _plain(more) | again
+
+
+def write_summary(content: dict[str, Any], path: str | Path) -> None:
+    """Write a summary as JSON."""
+    write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def _plain(row: dict[str, Any]) -> dict[str, Any]:
+    """JSON has no infinity and no NaN: what is undefined is null."""
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+
+
+def _csv(header, rows) -> str:
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return buffer.getvalue()

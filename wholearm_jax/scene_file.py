@@ -1,0 +1,277 @@
+"""Scene files: TOML in and out, validated; every complaint names the file, the key and the cause."""
+
+import difflib
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import jax.numpy as jnp
+import numpy as np
+import tomli_w
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from wholearm_jax.scene import COORDINATES, LINKS, Hand, Phase, Scene, formation, heading, parse_contact, polygon
+from wholearm_jax.writing import write_whole
+
+CONSTRAINTS = 4
+
+
+class SceneError(ValueError):
+    """A scene or schedule that cannot be used; the message names the file, the key and the cause."""
+
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Pair = tuple[Finite, Finite]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class _Finger(_Strict):
+    joint: Pair
+    length: Positive
+    offset: Finite = 0.0
+    inertia: Positive
+    viscous: NonNegative = 0.0
+    dry: NonNegative = 0.0
+    torque_limit: Positive
+
+
+class _Hand(_Strict):
+    finger1: _Finger
+    finger2: _Finger
+
+    @model_validator(mode="after")
+    def _sides(self) -> Self:
+        if self.finger1.joint[0] <= self.finger2.joint[0]:
+            raise ValueError("finger 1 is the right one: its joint's x must exceed that of finger 2")
+        return self
+
+
+class _Frictions(_Strict):
+    palm: NonNegative
+    finger1: NonNegative
+    finger2: NonNegative
+
+
+def _simple_anticlockwise(vertices: list[Pair]) -> list[Pair]:
+    """Refuse polygons that have no area, run clockwise, repeat a vertex or cross themselves."""
+    points = np.asarray(vertices)
+    size = np.ptp(points, axis=0).max()
+    for k, edge in enumerate(np.roll(points, -1, 0) - points):
+        if np.hypot(*edge) <= 1e-9 * size:
+            raise ValueError(f"degenerate: vertices {k} and {(k + 1) % len(points)} coincide")
+    following = np.roll(points, -1, 0)
+    area = (points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum() / 2
+    crossing = _crossing(points)
+    if crossing is not None:
+        raise ValueError("edges {} and {} cross: the polygon intersects itself".format(*crossing))
+    if abs(area) <= 1e-9 * size**2:
+        raise ValueError("degenerate: the polygon has no area")
+    if area < 0:
+        raise ValueError("clockwise: give the vertices anticlockwise")
+    return vertices
+
+
+def _crossing(points: np.ndarray) -> tuple[int, int] | None:
+    """The first two edges that touch without being neighbours, or fold back on each other."""
+    count = len(points)
+
+    def side(a, b, c):
+        return np.sign((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+
+    def within(a, b, c):
+        return min(a[0], b[0]) <= c[0] <= max(a[0], b[0]) and min(a[1], b[1]) <= c[1] <= max(a[1], b[1])
+
+    for i in range(count):
+        a, b = points[i], points[(i + 1) % count]
+        for j in range(i + 1, count):
+            c, d = points[j], points[(j + 1) % count]
+            if j == i + 1 or (i == 0 and j == count - 1):
+                shared, one, other = (b, a, d) if j == i + 1 else (a, b, c)
+                if side(one, shared, other) == 0 and (one - shared) @ (other - shared) > 0:
+                    return i, j
+                continue
+            turns = side(a, b, c), side(a, b, d), side(c, d, a), side(c, d, b)
+            proper = turns[0] * turns[1] < 0 and turns[2] * turns[3] < 0
+            pairs = ((turns[0], a, b, c), (turns[1], a, b, d), (turns[2], c, d, a), (turns[3], c, d, b))
+            if proper or any(turn == 0 and within(*ends) for turn, *ends in pairs):
+                return i, j
+    return None
+
+
+class _Object(_Strict):
+    vertices: Annotated[list[Pair], Field(min_length=3), AfterValidator(_simple_anticlockwise)]
+    mass: Positive
+    friction: NonNegative | _Frictions
+    inertia: Positive | None = None
+    center_of_mass: Pair | None = None
+
+
+class _Start(_Strict):
+    x: Finite
+    y: Finite
+    phi: Finite
+    theta1: Finite
+    theta2: Finite
+
+
+class _Phase(_Strict):
+    name: str
+    contacts: list[str]
+    toward: str
+    duration: Positive
+    until: dict[Literal["x", "y", "phi", "theta1", "theta2"], Finite] | None = None
+    arrive: Literal["rest", "moving"] = "rest"
+
+    @model_validator(mode="after")
+    def _readable(self) -> Self:
+        rows = [parse_contact(text) for text in self.contacts]
+        if len(set(row[:3] for row in rows)) < len(rows):
+            raise ValueError("contacts: the same contact stands twice")
+        if any(row[3] for row in rows):
+            raise ValueError("contacts: rolling contacts are not supported yet; every contact must slide")
+        if len(rows) != CONSTRAINTS:
+            raise ValueError(f"contacts: {len(rows)} constraints; a wire needs exactly {CONSTRAINTS}")
+        names = [c + sign for c in COORDINATES for sign in "+-"]
+        if self.toward not in names:
+            raise ValueError(f"toward: '{self.toward}' is not a coordinate and a sign, such as x- or phi+")
+        if self.until is not None and len(self.until) != 1:
+            raise ValueError("until: give exactly one coordinate")
+        return self
+
+
+class _Scene(_Strict):
+    title: str
+    gravity: Finite | Pair
+    hand: _Hand
+    object: _Object
+    start: _Start
+    phase: Annotated[list[_Phase], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _known_features(self) -> Self:
+        count = len(self.object.vertices)
+        for k, phase in enumerate(self.phase):
+            for text in phase.contacts:
+                if parse_contact(text)[2] >= count:
+                    raise ValueError(f"phase[{k}].contacts: '{text}': the object has vertices 0 to {count - 1}")
+        return self
+
+
+def bundled() -> tuple[str, ...]:
+    """The names of the scenes that come with the package."""
+    folder = resources.files("wholearm_jax") / "scenes"
+    return tuple(sorted(p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml")))
+
+
+def load(name: str | Path) -> Scene:
+    """Read a scene: a bundled one by name (`"heptagon"`), any other by path. Raises `SceneError`."""
+    if str(name) in bundled():
+        text = (resources.files("wholearm_jax") / "scenes" / f"{name}.toml").read_text()
+        return parse(tomllib.loads(text), str(name))
+    path = Path(name)
+    try:
+        data = tomllib.loads(path.read_text())
+    except FileNotFoundError:
+        near = difflib.get_close_matches(str(name), bundled(), 1)
+        hint = f"; did you mean the bundled scene '{near[0]}'?" if near else f"; bundled scenes: {', '.join(bundled())}"
+        raise SceneError(f"{path}: no such file{hint}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{path}: not valid TOML: {error}") from None
+    return parse(data, str(path))
+
+
+def parse(data: dict[str, Any], source: str = "scene") -> Scene:
+    """A scene from nested dictionaries, as TOML gives them. Raises `SceneError`."""
+    try:
+        checked = _Scene.model_validate(data)
+    except ValidationError as error:
+        raise SceneError(f"{source}: {_explain(error)}") from None
+    fingers = (checked.hand.finger1, checked.hand.finger2)
+    shape, friction = checked.object, checked.object.friction
+    each = friction if isinstance(friction, float) else [getattr(friction, link) for link in LINKS]
+    gravity = checked.gravity if isinstance(checked.gravity, tuple) else (0.0, -checked.gravity)
+    return Scene(
+        title=checked.title,
+        gravity=jnp.asarray(gravity),
+        hand=Hand(*(jnp.asarray([getattr(f, key) for f in fingers]) for key in Hand.__dataclass_fields__)),
+        object=polygon(shape.vertices, shape.mass, each, shape.inertia, shape.center_of_mass),
+        start=jnp.asarray([getattr(checked.start, c) for c in COORDINATES]),
+        phases=tuple(
+            Phase(p.name, formation(p.contacts), heading(p.toward, p.until), jnp.asarray(p.duration), p.arrive)
+            for p in checked.phase
+        ),
+    )
+
+
+def _explain(error: ValidationError) -> str:
+    """The first complaint in one line: the key, what is wrong, and for an unknown key the nearest known one."""
+    first = error.errors()[0]
+    place = ""
+    for part in first["loc"]:
+        if isinstance(part, int):
+            place += f"[{part}]"
+        elif part not in ("float", "_Frictions", "tuple[float, float]") and "constrained" not in str(part):
+            place += f".{part}" if place else str(part)
+    what = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        known = _known_keys(first["loc"][:-1])
+        near = difflib.get_close_matches(str(first["loc"][-1]), known, 1, cutoff=0.4)
+        what = "unknown key" + (f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(known)}")
+    return f"{place}: {what}" if place else what
+
+
+def _known_keys(location) -> list[str]:
+    tables = {"hand": _Hand, "finger1": _Finger, "finger2": _Finger, "object": _Object, "start": _Start}
+    tables |= {"phase": _Phase, "friction": _Frictions, "_Frictions": _Frictions}
+    names = [part for part in location if isinstance(part, str)]
+    return list(tables.get(names[-1], _Scene).model_fields) if names else list(_Scene.model_fields)
+
+
+def to_dict(scene: Scene) -> dict[str, Any]:
+    """A scene as nested dictionaries; the inverse of `parse`."""
+    fields = Hand.__dataclass_fields__
+    fingers = [{key: np.asarray(getattr(scene.hand, key))[k].tolist() for key in fields} for k in range(2)]
+    shape = scene.object
+    solid = {
+        "vertices": np.asarray(shape.vertices)[: int(shape.count)].tolist(),
+        "mass": float(shape.mass),
+        "friction": dict(zip(LINKS, np.asarray(shape.friction).tolist(), strict=True)),
+    }
+    if shape.inertia is not None:
+        solid["inertia"] = float(shape.inertia)
+    if shape.center_of_mass is not None:
+        solid["center_of_mass"] = np.asarray(shape.center_of_mass).tolist()
+    return {
+        "title": scene.title,
+        "gravity": np.asarray(scene.gravity).tolist(),
+        "hand": {"finger1": fingers[0], "finger2": fingers[1]},
+        "object": solid,
+        "start": dict(zip(COORDINATES, np.asarray(scene.start).tolist(), strict=True)),
+        "phase": [_phase_dict(phase) for phase in scene.phases],
+    }
+
+
+def _phase_dict(phase: Phase) -> dict[str, Any]:
+    way = phase.heading
+    row: dict[str, Any] = {
+        "name": phase.name,
+        "contacts": list(phase.formation.names),
+        "toward": COORDINATES[int(way.coordinate)] + ("+" if float(way.sign) > 0 else "-"),
+        "duration": float(phase.duration),
+    }
+    if int(way.until_coordinate) >= 0:
+        row["until"] = {COORDINATES[int(way.until_coordinate)]: float(way.until_value)}
+    return row | ({"arrive": phase.arrive} if phase.arrive != "rest" else {})
+
+
+def save(scene: Scene, path: str | Path) -> None:
+    """Write a scene as TOML, whole or not at all."""
+    write_whole(path, tomli_w.dumps(to_dict(scene)))
