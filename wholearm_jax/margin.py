@@ -2,9 +2,11 @@ r"""Score: the compressive margin of a motion, exact in time, and the smooth min
 
 Between accepted steps `s(u)` is the quintic with the right `s`, `ds/du` and `d2s/du2` at both ends, so that forces are
 known at every time, not only at steps. The margin is the least `c_n` over continuous time and all contacts: samples
-find its neighbourhood, Newton's method its place. Its derivative is that of the force at the place found (the envelope
+find its neighbourhood, golden section its place. Its derivative is that of the force at the place found (the envelope
 theorem), landings and knots included.
 """
+
+import math
 
 import equinox as eqx
 import jax
@@ -58,8 +60,8 @@ def arcs(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion)
 
     moving = live & ~motion.held
     d0, d1 = jnp.where(moving, d0, 0.0), jnp.where(moving, d1, 0.0)
-    b0 = jnp.where(moving, bend(motion.share[:-1], s0, motion.entry_w), 0.0)
-    b1 = jnp.where(moving, bend(motion.share[1:], s1, motion.w[1:]), 0.0)
+    ends = [motion.share[:-1], motion.share[1:]], [s0, s1], [motion.entry_w, motion.w[1:]]
+    b0, b1 = jnp.where(moving, jax.vmap(bend)(*map(jnp.stack, ends)), 0.0)
     rise = s1 - s0
     quintic = [
         s0,
@@ -155,22 +157,27 @@ def smooth_margin(values, weights, temperature: Float[Array, ""]) -> tuple[Float
 
 
 def _minimise(function, seat, reach):
-    """The least point of `function` within `reach` of `seat` in [0, 1]: Newton on the slope, bisecting a bracket."""
-    slope = jax.grad(function)
+    """The least point of `function` within `reach` of `seat` in [0, 1], by golden section.
+
+    The place is good to the square root of rounding, the value to rounding. A bracket's end counts where it is lower.
+    """
+    golden = (math.sqrt(5) - 1) / 2
     low, high = jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0)
 
-    def narrow(_, state):
-        low, high, xi = state
-        g, curve = jax.jvp(slope, (xi,), (jnp.ones_like(xi),))
-        low, high = jnp.where(g < 0, xi, low), jnp.where(g < 0, high, xi)
-        guess = xi - g / jnp.where(curve > 0, curve, 1.0)
-        fine = (curve > 0) & (guess > low) & (guess < high)
-        return low, high, jnp.where(fine, guess, (low + high) / 2)
+    def narrow(k, state):
+        """Both ends first, then the two inner points; each round keeps the part that holds the lower one."""
+        low, high, best, least = state
+        width = high - low
+        points = jnp.where(k == 0, jnp.stack([low, high]), jnp.stack([high - golden * width, low + golden * width]))
+        values = jax.vmap(function)(points)
+        lower = jnp.argmin(values)
+        better = values[lower] < least
+        low = jnp.where((k > 0) & (lower == 1), points[0], low)
+        high = jnp.where((k > 0) & (lower == 0), points[1], high)
+        return low, high, jnp.where(better, points[lower], best), jnp.minimum(values[lower], least)
 
-    # An edge of the bracket counts as the least point where the slope says so.
-    _, _, inner = jax.lax.fori_loop(0, 12, narrow, (low, high, (low + high) / 2))
-    places = jnp.stack([low, inner, high])
-    return stop_gradient(places[jnp.argmin(jax.vmap(function)(places))])
+    start = (low, high, seat * jnp.ones_like(low), jnp.full_like(low, jnp.inf))
+    return stop_gradient(jax.lax.fori_loop(0, 40, narrow, start)[2])
 
 
 def _first_tension(table, seen, duration, steps, values):
@@ -184,12 +191,14 @@ def _first_tension(table, seen, duration, steps, values):
     high = sample * width
 
     def halve(_, bracket):
-        low, high = bracket
+        low, high, contact = bracket
         middle = (low + high) / 2
-        tensile = forces_on(table, seen, duration, arc, middle).min() < 0
-        return jnp.where(tensile, low, middle), jnp.where(tensile, middle, high)
+        forces = forces_on(table, seen, duration, arc, middle)
+        tensile = forces.min() < 0
+        contact = jnp.where(tensile, jnp.argmin(forces), contact)
+        return jnp.where(tensile, low, middle), jnp.where(tensile, middle, high), contact
 
-    _, xi = jax.lax.fori_loop(0, 50, halve, (jnp.maximum(high - width, 0.0), high))
-    contact = jnp.argmin(forces_on(table, seen, duration, arc, xi))
+    bracket = (jnp.maximum(high - width, 0.0), high, jnp.argmin(values[step, sample]))
+    _, xi, contact = jax.lax.fori_loop(0, 50, halve, bracket)
     share = on_arc(arc, xi)[0]
     return jnp.where(jnp.any(negative), share, jnp.inf), contact

@@ -68,6 +68,37 @@ class Motion(eqx.Module):
     status: Int[Array, ""]
 
 
+class _FirstStep(dfx.AbstractAdaptiveStepSizeController):
+    """A controller whose first step is a 32nd of the phase.
+
+    diffrax would check a first step passed to `diffeqsolve` by a host callback, and programs that call back to the
+    host are not kept in JAX's compilation cache.
+    """
+
+    controller: dfx.PIDController
+
+    @property
+    def rtol(self):
+        return self.controller.rtol
+
+    @property
+    def atol(self):
+        return self.controller.atol
+
+    @property
+    def norm(self):
+        return self.controller.norm
+
+    def wrap(self, direction):
+        return _FirstStep(self.controller.wrap(direction))
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        return self.controller.init(terms, t0, t1, y0, jnp.asarray(1 / 32, t0.dtype), args, func, error_order)
+
+    def adapt_step_size(self, *at):
+        return self.controller.adapt_step_size(*at)
+
+
 class _State(NamedTuple):
     share: Float[Array, ""]
     s: Float[Array, ""]
@@ -167,7 +198,7 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     y0 = jnp.stack([state.s, state.w])
     knots = stop_gradient(seen.share)
     control = dfx.ClipStepSizeController(
-        dfx.PIDController(rtol=how.tolerance, atol=how.tolerance),
+        _FirstStep(dfx.PIDController(rtol=how.tolerance, atol=how.tolerance)),
         step_ts=knots,
         jump_ts=knots if how.steps else None,
     )
@@ -176,7 +207,7 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
         how.solver,
         state.share,
         final,
-        jnp.asarray(1 / 32, y0.dtype),
+        None,
         y0,
         saveat=dfx.SaveAt(steps=True),
         stepsize_controller=control,

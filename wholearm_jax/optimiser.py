@@ -20,12 +20,13 @@ from wholearm_jax.motion import Integration
 from wholearm_jax.plan import Result, Traced, describe, outcomes, require_x64, run, trace
 from wholearm_jax.scene import Scene
 from wholearm_jax.schedule import Torque, padded
-from wholearm_jax.squeeze import PLACES, Bound, bound, holds
+from wholearm_jax.squeeze import Bound, bound, holds
 from wholearm_jax.status import Status
 
 HOTTEST, COLDEST, COOLING = 0.1, 2e-4, 0.5  # temperatures as shares of the bound, and the factor from one to the next
 FIRST = 0.9  # share of the torque limits that the start may use
 PROFILES = tuple((p, q) for p in (1.0, 2.0, 4.0, 8.0, 16.0) for q in (1.0, 2.0, 4.0, 8.0, 16.0))
+FINE = 8  # places a knot interval at which a starting motion is judged
 EVEN = 0.3  # share of the even motion in every profile, so that the object never quite stops on the way
 PATIENCE = 12  # steps without gain at the lowest temperature before a phase stops
 
@@ -137,15 +138,14 @@ def _optimise_phase(task: _Task, limits: Limits, optimiser, callback) -> tuple[T
     """Descend on one phase; return the best schedule (from time 0), why it stopped, and the steps taken."""
     table, how = task.traced.table, Integration(max_steps=128, adjoint="forward")
     if int(table.status) != Status.OK:
-        nothing = Torque(jnp.linspace(0.0, 1.0, task.knots) * task.duration, jnp.zeros((task.knots, 2)))
-        return nothing, f"the wire cannot be followed: {Status(int(table.status)).label}", []
+        return _evenly(task, np.zeros((task.knots, 2))), f"the wire cannot be followed: {Status(int(table.status)).label}", []
     values = _start(task.traced, task.duration, task.knots, FIRST)
     if task.bound <= 0:
         why = f"no torque within limits holds this formation at {100 * task.bound_share:.0f} % of its wire"
-        return Torque(jnp.linspace(0.0, 1.0, task.knots) * task.duration, values), why, []
+        return _evenly(task, values), why, []
     if task.pinned is not None:
-        values = values.at[0].set(task.pinned)
-    p = pack(_within_rate(values, limits, task), jnp.asarray(task.duration), table)
+        values[0] = np.asarray(task.pinned)
+    p = _pack(_within_rate(values, limits, task), jnp.asarray(task.duration), table)
     method = _DESCENT if optimiser is None else projected(optimiser)
     state, temperature = method.init(p), HOTTEST * task.bound
     best, best_margin, history, since = p, -np.inf, [], 0
@@ -172,12 +172,25 @@ def _optimise_phase(task: _Task, limits: Limits, optimiser, callback) -> tuple[T
             break
         if promised < temperature or taken == 0:
             temperature = max(temperature * COOLING, COLDEST * task.bound)
-    return unpack(best, table)[0], why, history
+    return _unpack(best, table)[0], why, history
+
+
+def _evenly(task: _Task, values) -> Torque:
+    return Torque(jnp.asarray(np.linspace(0.0, float(task.duration), task.knots)), jnp.asarray(values))
+
+
+_pack = jax.jit(pack)
+
+
+@jax.jit
+def _unpack(p, table):
+    schedule, duration = unpack(p, table)
+    return schedule, duration, padded(schedule)
 
 
 def _honest(p, table) -> tuple[float, Status]:
-    schedule, duration = unpack(p, table)
-    outcome = run(table, padded(schedule), jnp.zeros(()), duration, Integration(), True)
+    _, duration, schedule = _unpack(p, table)
+    outcome = run(table, schedule, jnp.zeros(()), duration, Integration(), True)
     return float(outcome.score.margin), Status(int(outcome.verdict.status))
 
 
@@ -186,38 +199,33 @@ def _start(traced: Traced, duration, knots: int, share: float):
 
     The even motion is taken unless another gains more than 2 % of its margin.
     """
-    table = traced.table
-    tight = eqx.tree_at(lambda t: t.torque_limit, table, share * table.torque_limit)
-    margins = np.asarray(_profile_margins(tight, duration))
-    even = margins[0] >= margins.max() - 0.02 * abs(margins.max())
-    torque = _profile_torques(tight, duration, jnp.asarray(PROFILES[0 if even else int(np.argmax(margins))]), knots)
-    return jnp.clip(torque, -tight.torque_limit, tight.torque_limit)
+    limit = share * np.asarray(traced.table.torque_limit)
+    table = eqx.tree_at(lambda t: t.torque_limit, traced.table, jnp.asarray(limit))
+    length, begin, time = float(table.length), float(table.breaks[0]), float(duration)
+    u = np.linspace(0.0, 1.0, FINE * (knots - 1) + 1)
+    motions = [_profile(u, *powers) for powers in PROFILES]
+    s, v, a = (length * np.stack(rows) for rows in zip(*motions, strict=True))
+    held = _holds(table, begin + s, v / time, a / time**2)
+    margins = np.asarray(held.margin).min(1)
+    best = 0 if margins[0] >= margins.max() - 0.02 * abs(margins.max()) else int(np.argmax(margins))
+    return np.clip(np.asarray(held.torque)[best, ::FINE], -limit, limit)
 
 
-def _profile(table, duration, powers, u):
-    """Motion from rest to rest along the whole wire, `EVEN` even and the rest with speed `v ~ u^p (1 - u)^q`."""
-    p, q = powers
-    scale = (1 - EVEN) * table.length / jnp.exp(jax.scipy.special.betaln(p + 1, q + 1))
-    inner = jnp.clip(u, 1e-12, 1 - 1e-12)
-    v = scale * inner**p * (1 - inner) ** q
+def _profile(u, p, q):
+    """Motion over a unit length and time from rest to rest, `EVEN` even and the rest with speed `v ~ u^p (1 - u)^q`."""
+    inner = np.clip(u, 1e-12, 1 - 1e-12)
+    v = inner**p * (1 - inner) ** q
     a = v * (p / inner - q / (1 - inner))
-    s = (1 - EVEN) * jax.scipy.special.betainc(p + 1, q + 1, u) + EVEN * (3 * u**2 - 2 * u**3)
-    v, a = v + EVEN * table.length * 6 * (u - u**2), a + EVEN * table.length * (6 - 12 * u)
-    return table.breaks[0] + table.length * s, v / duration, a / duration**2
+    s = np.concatenate([[0.0], np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(u))])
+    scale = (1 - EVEN) / s[-1]
+    return (
+        scale * s + EVEN * (3 * u**2 - 2 * u**3),
+        scale * v + EVEN * 6 * (u - u**2),
+        scale * a + EVEN * (6 - 12 * u),
+    )
 
 
-@eqx.filter_jit
-def _profile_margins(table, duration):
-    """For each profile the least force of the best squeeze over the motion."""
-    u = jnp.linspace(0.0, 1.0, 4 * PLACES + 1)
-    return jax.vmap(lambda powers: holds(table, *_profile(table, duration, powers, u)).margin.min())(jnp.asarray(PROFILES))
-
-
-@eqx.filter_jit
-def _profile_torques(table, duration, powers, knots):
-    return holds(table, *_profile(table, duration, powers, jnp.linspace(0.0, 1.0, knots))).torque
-
-
+_holds = jax.jit(jax.vmap(holds, (None, 0, 0, 0)))
 _DESCENT = preconditioned()
 _bound = jax.jit(bound)
 
@@ -232,12 +240,10 @@ def _limits(task: _Task, rate_limit, durations) -> Limits:
 def _within_rate(values, limits: Limits, task: _Task):
     """The nearest knots, taken in order, that keep 90 % of the rate limit."""
     largest = 0.9 * np.asarray(limits.rate) * float(task.duration) / (task.knots - 1)
-    if not np.all(np.isfinite(largest)):
-        return values
-    rows = [np.asarray(values[0])]
-    for row in np.asarray(values[1:]):
+    rows = [values[0]]
+    for row in values[1:]:
         rows.append(np.clip(row, rows[-1] - largest, rows[-1] + largest))
-    return jnp.asarray(np.stack(rows))
+    return np.stack(rows)
 
 
 def _joined(scene: Scene, blocks) -> Torque:
@@ -247,7 +253,7 @@ def _joined(scene: Scene, blocks) -> Torque:
         end = start + float(phase.duration)
         times.append(np.linspace(start, end, block.shape[0]))
         start = end
-    return Torque(jnp.asarray(np.concatenate(times)), jnp.concatenate([jnp.asarray(b) for b in blocks]))
+    return Torque(jnp.asarray(np.concatenate(times)), jnp.asarray(np.concatenate([np.asarray(b) for b in blocks])))
 
 
 def replace_duration(phase, duration):

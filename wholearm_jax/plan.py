@@ -105,6 +105,10 @@ def run(table: Table, schedule: Torque, start, duration, how: Integration, at_re
     return Outcome(motion, scored, judge(table, motion, scored, at_rest))
 
 
+_body, _padded = jax.jit(body), jax.jit(padded)
+
+
+@jax.jit
 def end_configuration(traced: Traced) -> Float[Array, "5"]:
     """`z` (SI) where a wire ends."""
     table = traced.table
@@ -119,7 +123,7 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     function's size, is below `tolerance`; pieces are added likewise. What cannot be traced says so in
     `Traced.table.status`, and what follows it cannot be trusted.
     """
-    solid, rough, found = body(scene.object), scene.start, []
+    solid, rough, found = _body(scene.object), scene.start, []
     for phase in scene.phases:
         traced = _refined(solid, scene, phase, rough, resolution, tolerance)
         found.append(traced)
@@ -147,7 +151,7 @@ def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, toleranc
 
 def outcomes(scene: Scene, torque: Torque, traced: tuple[Traced, ...], how: Integration) -> tuple[Outcome, ...]:
     """Simulate every phase; differentiable, and usable under any JAX transformation."""
-    schedule, start, found = padded(torque), jnp.zeros((), torque.times.dtype), []
+    schedule, start, found = _padded(torque), jnp.zeros((), torque.times.dtype), []
     for phase, at in zip(scene.phases, traced, strict=True):
         found.append(run(at.table, schedule, start, phase.duration, how, phase.arrive == "rest"))
         start = start + phase.duration
@@ -275,7 +279,7 @@ def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shar
 
 def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
     """Every phase at `samples` evenly spaced times; a phase that failed stops at its failure, later ones are left out."""
-    found, schedule = [], padded(result.torque)
+    found, schedule = [], _padded(result.torque)
     for phase in result.phases:
         if int(phase.traced.table.status) != Status.OK:
             break

@@ -123,14 +123,13 @@ class Body(eqx.Module):
 
 def polygon(vertices, mass, friction, inertia=None, center_of_mass=None) -> Polygon:
     """Build a `Polygon` from `(n, 2)` vertices; `friction` is a number or one for each link."""
-    given = jnp.asarray(vertices, float)
-    count = given.shape[0]
-    padding = jnp.broadcast_to(given[-1], (-count % 8, 2))
+    given = np.asarray(vertices, float)
+    padding = np.broadcast_to(given[-1], (-len(given) % 8, 2))
     return Polygon(
-        vertices=jnp.concatenate([given, padding]),
-        count=jnp.asarray(count),
+        vertices=jnp.asarray(np.concatenate([given, padding])),
+        count=jnp.asarray(len(given)),
         mass=jnp.asarray(mass, float),
-        friction=jnp.broadcast_to(jnp.asarray(friction, float), (3,)),
+        friction=jnp.asarray(np.broadcast_to(np.asarray(friction, float), (3,))),
         inertia=None if inertia is None else jnp.asarray(inertia, float),
         center_of_mass=None if center_of_mass is None else jnp.asarray(center_of_mass, float),
     )
