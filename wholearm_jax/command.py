@@ -78,6 +78,7 @@ def optimise(
     from wholearm_jax.optimiser import optimise as find
 
     begun = time.perf_counter()
+    _traced(scene, loaded)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bars = [progress.add_task(p.name, total=steps, state="waiting") for p in loaded.phases]
@@ -92,7 +93,8 @@ def optimise(
             progress.update(bar, completed=steps, state=why)
     seconds = time.perf_counter() - begun
     for phase, top, share, why in zip(found.result.phases, found.bounds, found.reached, found.stopped, strict=True):
-        print(f"{phase.message}; bound {float(top.value):.4g} N, {100 * share:.1f} % of it reached; stopped: {why}")
+        reached = f", {100 * share:.1f} % of it reached" if 0 < share < float("inf") else ""
+        print(f"{phase.message}; bound {float(top.value):.4g} N{reached}; stopped: {why}")
     more = {"command": "optimise", "knots": knots, "steps": len(found.history), "seconds": seconds}
     more |= {"rate_limit": rate_limit, "stopped": list(found.stopped)}
     _finish(found.result, folder, samples, bounds=tuple(float(b.value) for b in found.bounds), **more)
@@ -111,12 +113,11 @@ def simulate(
     loaded = _scene(scene, set_)
     from wholearm_jax.optimiser import bounds
     from wholearm_jax.plan import simulate as follow
-    from wholearm_jax.plan import trace
     from wholearm_jax.result_file import read_torque
 
     schedule = read_torque(torque)
     folder = _folder(out)
-    traced = trace(loaded)
+    traced = _traced(scene, loaded)
     try:
         result = follow(loaded, schedule, tolerance=tolerance, traced=traced)
     except ValueError as error:
@@ -134,23 +135,55 @@ def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
     folder = _folder(out)
     from wholearm_jax.baseline import search as look
 
+    _traced(scene, loaded)
     found = look(loaded)
     for phase in found.result.phases:
         print(phase.message)
     print(f"{found.simulations} simulations in {found.seconds:.2f} s")
-    _finish(
-        found.result, folder, samples, command="search", simulations=found.simulations, seconds=found.seconds
-    )
+    _finish(found.result, folder, samples, command="search", simulations=found.simulations, seconds=found.seconds)
 
 
 def _scene(name: str, changes: list[str] | None):
-    """Load a scene, apply `--set`, and refuse a start at which its contacts cannot all touch."""
+    """Load a scene and apply `--set`."""
     from wholearm_jax.scene_file import load
 
     scene = load(name)
     for change in changes or ():
         scene = _changed(scene, change)
     return scene
+
+
+def _traced(name: str, scene):
+    """Trace a plan; refuse it, naming the contact, where a formation's contacts cannot all touch where it begins."""
+    import numpy as np
+
+    from wholearm_jax.contacts import frames
+    from wholearm_jax.plan import end_configuration, trace
+    from wholearm_jax.scene import body
+    from wholearm_jax.system import system
+
+    @jax.jit
+    def apart(formation, z):
+        mechanics = system(body(scene.object), scene.hand, scene.gravity, formation)
+        at, held = frames(mechanics.contacts, z), mechanics.contacts
+        beyond = jax.numpy.maximum(0.0, jax.numpy.maximum(held.lower - at.along, at.along - held.upper))
+        return jax.numpy.hypot(at.gap, beyond), mechanics.length, mechanics.configuration_unit
+
+    traced = trace(scene)
+    for k, (phase, at) in enumerate(zip(scene.phases, traced, strict=True)):
+        gap, length, unit = apart(phase.formation, at.wire.start)
+        where = "with the others, from this start"
+        if k > 0 and not np.any(gap > 1e-6):
+            gap, _, _ = apart(phase.formation, end_configuration(traced[k - 1]) / unit)
+            where = f"where phase '{scene.phases[k - 1].name}' ends"
+        if not np.all(gap <= 1e-6):
+            worst = int(np.argmax(gap))
+            which, size = phase.formation.names[worst], float(gap[worst] * length)
+            key = f"phase[{k}].contacts"
+            raise _BadInput(f"{name}: {key}: {which} cannot touch {where}: a gap of {size:.3g} m stays open")
+        if at.table.status != 0:
+            break  # what follows a wire that cannot be followed has no start
+    return traced
 
 
 def _changed(scene, change: str):
@@ -161,7 +194,8 @@ def _changed(scene, change: str):
     key, _, value = change.partition("=")
     phase, _, field = key.rpartition(".")
     names = [p.name for p in scene.phases]
-    row = names.index(phase) if phase in names else int(phase) if phase.isdigit() and int(phase) < len(names) else None
+    numbered = phase.isdecimal() and int(phase) < len(names)
+    row = names.index(phase) if phase in names else int(phase) if numbered else None
     if field != "duration" or row is None:
         raise _BadInput(f"--set {change}: write PHASE.duration=SECONDS; phases: {', '.join(names)}")
     try:
@@ -211,9 +245,10 @@ def _draw(result, folder: Path) -> None:
 
     matplotlib.use("agg")
     from wholearm_jax.drawing import draw_result, draw_strip
+    from wholearm_jax.plan import trajectory
     from wholearm_jax.writing import write_whole
 
-    figures = {"plan": draw_strip, "result": draw_result}
+    figures = {"plan": draw_strip, "result": draw_result} if trajectory(result) else {}  # no motion, nothing to draw
     for name, draw in figures.items():
         figure = draw(result)
         for kind in ("png", "svg"):

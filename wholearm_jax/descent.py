@@ -1,7 +1,7 @@
 r"""Descend: torque knots of one phase, improved by gradient descent through the simulation.
 
 The variables `p` are the torques at the knots, in units of the torque limit, and the logarithm of the duration. The
-loss is minus the smooth margin (`margin.smooth_margin`) plus logarithmic barriers of the same temperature on torque,
+loss is minus the smooth margin (`forces.smooth_margin`) plus logarithmic barriers of the same temperature on torque,
 rate and duration limits. Arrival at rest, `e(p) = (s(T) - s_end, w(T)) / length = 0`, is an equality constraint.
 
 Descent is preconditioned: with `J` the derivatives of the sampled forces, `H = J^T phi'' J` (the Gauss-Newton metric of
@@ -24,7 +24,7 @@ import optax
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float
 
-from wholearm_jax.margin import arcs, on_arc, sampled_forces, smooth_margin
+from wholearm_jax.forces import arcs, on_arc, sampled_forces, smooth_margin
 from wholearm_jax.motion import Integration, move
 from wholearm_jax.reduction import Table
 from wholearm_jax.schedule import Torque, window

@@ -28,6 +28,7 @@ from wholearm_jax.schedule import Window, interval, torque_in
 from wholearm_jax.status import Status
 
 ADJOINTS = {
+    "none": dfx.DirectAdjoint(),
     "both": dfx.DirectAdjoint(),  # forward and reverse mode
     "forward": dfx.ForwardMode(),
     "reverse": dfx.RecursiveCheckpointAdjoint(),
@@ -37,8 +38,10 @@ ADJOINTS = {
 class Integration(eqx.Module):
     """How to integrate: diffrax solver, error `tolerance` a step (relative, of the wire's scale), limits, adjoint.
 
-    `steps` says that the torque schedule has steps inside the phase. `adjoint` is one of `"both"`, `"forward"`,
-    `"reverse"`: what the solve will be differentiated by. All of it is static.
+    `steps` says that the torque schedule has steps inside the phase. `adjoint` says what the solve will be
+    differentiated by: `"none"`, `"forward"`, `"reverse"` or `"both"`. Where reverse mode is wanted, the steps are found
+    once by the adaptive controller and taken again as they are: differentiating saved steps through rejected ones in
+    reverse mode gives wrong derivatives (seen with diffrax 0.7.2), and the repetition has none. All of it is static.
     """
 
     solver: dfx.AbstractSolver = eqx.field(static=True, default=dfx.Dopri8())
@@ -46,7 +49,7 @@ class Integration(eqx.Module):
     max_steps: int = eqx.field(static=True, default=256)
     stages: int = eqx.field(static=True, default=8)
     steps: bool = eqx.field(static=True, default=False)
-    adjoint: str = eqx.field(static=True, default="both")
+    adjoint: str = eqx.field(static=True, default="none")
 
 
 class Motion(eqx.Module):
@@ -97,6 +100,23 @@ class _FirstStep(dfx.AbstractAdaptiveStepSizeController):
 
     def adapt_step_size(self, *at):
         return self.controller.adapt_step_size(*at)
+
+
+class _Repeat(dfx.AbstractStepSizeController):
+    """Takes given steps and rejects none: step `i` ends at `ends[i]`, the next begins at `begins[i]`."""
+
+    ends: Float[Array, "steps"]
+    begins: Float[Array, "steps"]
+
+    def wrap(self, direction):
+        return self
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        return self.ends[0], jnp.asarray(1)
+
+    def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, state):
+        following = self.ends[jnp.minimum(state, self.ends.shape[0] - 1)]
+        return True, self.begins[state - 1], following, True, state + 1, dfx.RESULTS.successful
 
 
 class _State(NamedTuple):
@@ -176,6 +196,18 @@ def acceleration(table: Table, seen: Window, duration, piece, row, share, s, w):
     return duration**2 * (a[0] + a[3] * tau[0] + a[4] * tau[1]) + duration * a[2] * w + a[1] * w**2
 
 
+def single_step(table, seen, duration, how: Integration, piece, row, share, y, length):
+    """One step of the solver from `y = (s, w)` at a share of the phase, within a piece and a torque interval."""
+    solver = eqx.tree_at(lambda x: x.scan_kind, how.solver, "bounded", is_leaf=lambda x: x is None)
+
+    def field(u, y, args):
+        return jnp.stack([y[1], acceleration(*args, piece, row, u, y[0], y[1])])
+
+    term, args = dfx.ODETerm(field), (table, seen, duration)
+    state = solver.init(term, share, share + length, y, args)
+    return solver.step(term, share, share + length, y, args, state, made_jump=True)[0]
+
+
 def _stage(table, seen, duration, how, free, state: _State) -> _State:
     """Wait at rest if need be, then move until the piece ends, the object stops, or time is over."""
     rest = (state.w <= 0) & ~free
@@ -191,31 +223,8 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     floor = jnp.where(free, -jnp.inf, 0.0)
     final = jnp.where(blocked, state.share, 1.0)
 
-    def field(u, y, _):
-        row = interval(seen, u)
-        return jnp.stack([y[1], acceleration(table, seen, duration, state.piece, row, u, y[0], y[1])])
-
+    solution = _integrate(table, seen, duration, how, state, final, goal, floor)
     y0 = jnp.stack([state.s, state.w])
-    knots = stop_gradient(seen.share)
-    control = dfx.ClipStepSizeController(
-        _FirstStep(dfx.PIDController(rtol=how.tolerance, atol=how.tolerance)),
-        step_ts=knots,
-        jump_ts=knots if how.steps else None,
-    )
-    solution = dfx.diffeqsolve(
-        dfx.ODETerm(field),
-        how.solver,
-        state.share,
-        final,
-        None,
-        y0,
-        saveat=dfx.SaveAt(steps=True),
-        stepsize_controller=control,
-        event=dfx.Event(lambda t, y, args, **_: (y[0] > goal) | (y[1] < floor)),
-        adjoint=ADJOINTS[how.adjoint],
-        max_steps=how.max_steps,
-        throw=False,
-    )
     taken = solution.stats["num_accepted_steps"]
     overshot = dfx.is_event(solution.result)
     complete = dfx.is_successful(solution.result) | overshot
@@ -258,6 +267,50 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
         status=status,
         done=blocked | ~complete | (passed & last) | ~overshot,
     )
+
+
+def _integrate(table, seen, duration, how, state, final, goal, floor):
+    """Steps from the state to `final` or to the first that passes `goal` or falls below the speed `floor`."""
+
+    def solve(inputs, controller, adjoint):
+        table, seen, duration, share, y0, final, goal = inputs
+
+        def field(u, y, _):
+            row = interval(seen, u)
+            return jnp.stack([y[1], acceleration(table, seen, duration, state.piece, row, u, y[0], y[1])])
+
+        return dfx.diffeqsolve(
+            dfx.ODETerm(field),
+            how.solver,
+            share,
+            final,
+            None,
+            y0,
+            saveat=dfx.SaveAt(steps=True),
+            stepsize_controller=controller,
+            event=dfx.Event(lambda t, y, args, **_: (y[0] > goal) | (y[1] < floor)),
+            adjoint=ADJOINTS[adjoint],
+            max_steps=how.max_steps,
+            throw=False,
+        )
+
+    inputs = (table, seen, duration, state.share, jnp.stack([state.s, state.w]), final, goal)
+    knots = seen.share
+
+    def adaptive(knots):
+        errors = _FirstStep(dfx.PIDController(rtol=how.tolerance, atol=how.tolerance))
+        return dfx.ClipStepSizeController(errors, step_ts=knots, jump_ts=knots if how.steps else None)
+
+    if how.adjoint in ("none", "forward"):
+        return solve(inputs, adaptive(knots), how.adjoint)
+    ends = solve(stop_gradient(inputs), adaptive(stop_gradient(knots)), "none").ts
+    ends = jnp.where(jnp.isfinite(ends), ends, stop_gradient(final))
+    # A step that ends on a knot moves with it; the next begins behind the knot where the torque may step there.
+    knot = knots[jnp.argmin(jnp.abs(ends[:, None] - stop_gradient(knots)), axis=1)]
+    on_knot = jnp.abs(ends - stop_gradient(knot)) < 1e-13
+    ends = jnp.where(on_knot, ends + (knot - stop_gradient(knot)), ends)
+    begins = jnp.where(on_knot, jnp.nextafter(stop_gradient(knot), jnp.inf), ends) if how.steps else ends
+    return solve(inputs, _Repeat(ends, begins), how.adjoint)
 
 
 def _append(state, wanted, share, s, w, entry_w, *, held):
@@ -314,17 +367,13 @@ def _land(table, seen, duration, how, piece, node, end, goal, passed, wanted):
     row = interval(seen, stop_gradient(share + longest / 2))
     target = jnp.where(passed, jnp.where(jnp.isfinite(goal), goal, 0.0), 0.0)
     which = jnp.where(passed, 0, 1)
-    solver = eqx.tree_at(lambda x: x.scan_kind, how.solver, "bounded", is_leaf=lambda x: x is None)
 
-    def field(u, y, args):
+    def field(share, y, args):
         table, seen, duration = args
-        return jnp.stack([y[1], acceleration(table, seen, duration, piece, row, u, y[0], y[1])])
-
-    term = dfx.ODETerm(field)
+        return jnp.stack([y[1], acceleration(table, seen, duration, piece, row, share, y[0], y[1])])
 
     def step(share, length, y, args):
-        state = solver.init(term, share, share + length, y, args)
-        return solver.step(term, share, share + length, y, args, state, made_jump=True)[0]
+        return single_step(*args, how, piece, row, share, y, length)
 
     args = (table, seen, duration)
     fixed = stop_gradient((share, jnp.stack([s, w]), args, target, longest))

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.margin import Score, arcs, force, on_arc, score
+from wholearm_jax.forces import Score, arcs, force, on_arc, score
 from wholearm_jax.motion import Integration, Motion, move
 from wholearm_jax.reduction import Table, horner, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, body, contact_name
@@ -101,7 +101,7 @@ def run(table: Table, schedule: Torque, start, duration, how: Integration, at_re
     """Simulate one phase from rest at its wire's start, score it and judge it."""
     seen = window(schedule, start, duration)
     motion = move(table, seen, duration, how=how)
-    scored = score(table, seen, duration, motion)
+    scored = score(table, seen, duration, motion, how)
     return Outcome(motion, scored, judge(table, motion, scored, at_rest))
 
 
@@ -159,7 +159,7 @@ def outcomes(scene: Scene, torque: Torque, traced: tuple[Traced, ...], how: Inte
 
 
 def margin(
-    scene: Scene, torque: Torque, *, how: Integration = Integration(), resolution: Resolution = Resolution()
+    scene: Scene, torque: Torque, *, how: Integration = Integration(adjoint="both"), resolution: Resolution = Resolution()
 ) -> Float[Array, ""]:
     """The compressive margin [N] of a plan: the least `c_n` over time and contacts, formations assumed to hold.
 

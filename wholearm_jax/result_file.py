@@ -28,14 +28,14 @@ TRAJECTORY_COLUMNS = (
 def read_torque(path: str | Path) -> Torque:
     """Read a torque schedule (header `t,tau1,tau2`). Raises `SceneError` naming the file, the line and the cause."""
     try:
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8-sig") as file:
             rows = list(csv.reader(file))
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if not rows:
-        raise SceneError(f"{path}: the file is empty; it needs the header t,tau1,tau2 and at least two rows")
+        raise SceneError(f"{path}: line 1: the file is empty; it needs the header t,tau1,tau2 and at least two rows")
     header = [name.strip() for name in rows[0]]
     missing = [name for name in TORQUE_COLUMNS if name not in header]
     if missing:
@@ -48,17 +48,20 @@ def read_torque(path: str | Path) -> Torque:
         try:
             values = [float(row[place]) for place in places]
         except (ValueError, IndexError):
-            raise SceneError(f"{path}: line {line}: not three numbers: {','.join(row)}") from None
+            raise SceneError(f"{path}: line {line}: not three numbers: {','.join(row)!r:.60}") from None
         if not all(map(math.isfinite, values)):
-            raise SceneError(f"{path}: line {line}: not finite: {','.join(row)}")
+            raise SceneError(f"{path}: line {line}: not finite: {','.join(row)!r:.60}")
         if numbers and values[0] < numbers[-1][0]:
-            raise SceneError(f"{path}: line {line}: t = {values[0]:g} follows {numbers[-1][0]:g}: times must not decrease")
+            last = numbers[-1][0]
+            raise SceneError(f"{path}: line {line}: t = {values[0]:g} follows {last:g}: times must not decrease")
+        if len(numbers) > 1 and values[0] == numbers[-2][0]:
+            raise SceneError(f"{path}: line {line}: t = {values[0]:g} stands a third time; twice is a step")
         numbers.append(values)
     table = np.asarray(numbers).reshape(-1, 3)
     try:
         return torque(table[:, 0], table[:, 1:])
     except ValueError as error:
-        raise SceneError(f"{path}: {error}") from None
+        raise SceneError(f"{path}: line {len(rows)}: the file ends here: {error}") from None
 
 
 def write_torque(schedule: Torque, path: str | Path) -> None:

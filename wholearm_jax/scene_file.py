@@ -1,6 +1,7 @@
 """Scene files: TOML in and out, validated; every complaint names the file, the key and the cause."""
 
 import difflib
+import re
 import tomllib
 from importlib import resources
 from pathlib import Path
@@ -9,7 +10,16 @@ from typing import Annotated, Any, Literal, Self
 import jax.numpy as jnp
 import numpy as np
 import tomli_w
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 from wholearm_jax.scene import COORDINATES, LINKS, Hand, Phase, Scene, formation, heading, parse_contact, polygon
 from wholearm_jax.writing import write_whole
@@ -21,10 +31,16 @@ class SceneError(ValueError):
     """A scene or schedule that cannot be used; the message names the file, the key and the cause."""
 
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 Pair = tuple[Finite, Finite]
+Coordinate = Literal["x", "y", "phi", "theta1", "theta2"]
+_NUMBER, _SEVERAL = "<number>", "<several>"  # tags that tell a number from a vector or a table
+
+
+def _tag(value: Any) -> str:
+    return _SEVERAL if isinstance(value, dict | list) else _NUMBER
 
 
 class _Strict(BaseModel):
@@ -65,14 +81,14 @@ def _simple_anticlockwise(vertices: list[Pair]) -> list[Pair]:
     for k, edge in enumerate(np.roll(points, -1, 0) - points):
         if np.hypot(*edge) <= 1e-9 * size:
             raise ValueError(f"degenerate: vertices {k} and {(k + 1) % len(points)} coincide")
-    following = np.roll(points, -1, 0)
-    area = (points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum() / 2
+    points = points - points.mean(0)
+    if np.linalg.svd(points, compute_uv=False)[1] <= 1e-9 * size:
+        raise ValueError("degenerate: the vertices lie on one line, the polygon has no area")
     crossing = _crossing(points)
     if crossing is not None:
-        raise ValueError("edges {} and {} cross: the polygon intersects itself".format(*crossing))
-    if abs(area) <= 1e-9 * size**2:
-        raise ValueError("degenerate: the polygon has no area")
-    if area < 0:
+        raise ValueError("edges {} and {} cross or touch: the polygon intersects itself".format(*crossing))
+    following = np.roll(points, -1, 0)
+    if (points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum() < 0:
         raise ValueError("clockwise: give the vertices anticlockwise")
     return vertices
 
@@ -107,7 +123,9 @@ def _crossing(points: np.ndarray) -> tuple[int, int] | None:
 class _Object(_Strict):
     vertices: Annotated[list[Pair], Field(min_length=3), AfterValidator(_simple_anticlockwise)]
     mass: Positive
-    friction: NonNegative | _Frictions
+    friction: Annotated[
+        Annotated[NonNegative, Tag(_NUMBER)] | Annotated[_Frictions, Tag(_SEVERAL)], Discriminator(_tag)
+    ]
     inertia: Positive | None = None
     center_of_mass: Pair | None = None
 
@@ -120,34 +138,41 @@ class _Start(_Strict):
     theta2: Finite
 
 
+def _four_sliding(contacts: list[str]) -> list[str]:
+    rows = [parse_contact(text) for text in contacts]
+    if len(set(row[:3] for row in rows)) < len(rows):
+        raise ValueError("the same contact stands twice")
+    if any(row[3] for row in rows):
+        raise ValueError("rolling contacts are not supported yet; every contact must slide")
+    if len(rows) != CONSTRAINTS:
+        raise ValueError(f"{len(rows)} constraints; a wire needs exactly {CONSTRAINTS}")
+    return contacts
+
+
+def _signed_coordinate(toward: str) -> str:
+    if toward not in [c + sign for c in COORDINATES for sign in "+-"]:
+        raise ValueError(f"'{toward}' is not a coordinate and a sign, such as x- or phi+")
+    return toward
+
+
+def _one_coordinate(until: dict[str, float]) -> dict[str, float]:
+    if len(until) != 1:
+        raise ValueError(f"give exactly one coordinate, not {len(until)}")
+    return until
+
+
 class _Phase(_Strict):
     name: str
-    contacts: list[str]
-    toward: str
+    contacts: Annotated[list[str], AfterValidator(_four_sliding)]
+    toward: Annotated[str, AfterValidator(_signed_coordinate)]
     duration: Positive
-    until: dict[Literal["x", "y", "phi", "theta1", "theta2"], Finite] | None = None
+    until: Annotated[dict[Coordinate, Finite], AfterValidator(_one_coordinate)] | None = None
     arrive: Literal["rest", "moving"] = "rest"
-
-    @model_validator(mode="after")
-    def _readable(self) -> Self:
-        rows = [parse_contact(text) for text in self.contacts]
-        if len(set(row[:3] for row in rows)) < len(rows):
-            raise ValueError("contacts: the same contact stands twice")
-        if any(row[3] for row in rows):
-            raise ValueError("contacts: rolling contacts are not supported yet; every contact must slide")
-        if len(rows) != CONSTRAINTS:
-            raise ValueError(f"contacts: {len(rows)} constraints; a wire needs exactly {CONSTRAINTS}")
-        names = [c + sign for c in COORDINATES for sign in "+-"]
-        if self.toward not in names:
-            raise ValueError(f"toward: '{self.toward}' is not a coordinate and a sign, such as x- or phi+")
-        if self.until is not None and len(self.until) != 1:
-            raise ValueError("until: give exactly one coordinate")
-        return self
 
 
 class _Scene(_Strict):
     title: str
-    gravity: Finite | Pair
+    gravity: Annotated[Annotated[Finite, Tag(_NUMBER)] | Annotated[Pair, Tag(_SEVERAL)], Discriminator(_tag)]
     hand: _Hand
     object: _Object
     start: _Start
@@ -172,11 +197,11 @@ def bundled() -> tuple[str, ...]:
 def load(name: str | Path) -> Scene:
     """Read a scene: a bundled one by name (`"heptagon"`), any other by path. Raises `SceneError`."""
     if str(name) in bundled():
-        text = (resources.files("wholearm_jax") / "scenes" / f"{name}.toml").read_text()
+        text = (resources.files("wholearm_jax") / "scenes" / f"{name}.toml").read_text("utf-8")
         return parse(tomllib.loads(text), str(name))
     path = Path(name)
     try:
-        data = tomllib.loads(path.read_text())
+        data = tomllib.loads(path.read_text("utf-8"))
     except FileNotFoundError:
         near = difflib.get_close_matches(str(name), bundled(), 1)
         hint = f"; did you mean the bundled scene '{near[0]}'?" if near else f"; bundled scenes: {', '.join(bundled())}"
@@ -211,27 +236,45 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
     )
 
 
+_WORDS = {
+    "missing": "missing",
+    "float_type": "must be a number",
+    "finite_number": "must be finite",
+    "string_type": "must be text",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "dict_type": "must be a table",
+    "model_type": "must be a table",
+}
+
+
 def _explain(error: ValidationError) -> str:
-    """The first complaint in one line: the key, what is wrong, and for an unknown key the nearest known one."""
-    first = error.errors()[0]
+    """One complaint in one line: the key, what is wrong, and for an unknown key the nearest known one.
+
+    The first complaint, but an unknown key before any other: what is missing is then often only misspelt.
+    """
+    first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
     place = ""
     for part in first["loc"]:
         if isinstance(part, int):
             place += f"[{part}]"
-        elif part not in ("float", "_Frictions", "tuple[float, float]") and "constrained" not in str(part):
+        elif part not in (_NUMBER, _SEVERAL, "[key]"):
             place += f".{part}" if place else str(part)
-    what = first["msg"].removeprefix("Value error, ")
+    what = re.sub("^(Input|List|Tuple) should", "must", first["msg"].removeprefix("Value error, "))
+    what = _WORDS.get(first["type"], what.replace(" after validation", ""))
+    if isinstance(first["input"], float | int | str) and first["type"] != "value_error":
+        what += f", not {first['input']!r:.40}"
     if first["type"] == "extra_forbidden":
         known = _known_keys(first["loc"][:-1])
         near = difflib.get_close_matches(str(first["loc"][-1]), known, 1, cutoff=0.4)
         what = "unknown key" + (f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(known)}")
-    return f"{place}: {what}" if place else what
+    return " ".join((f"{place}: {what}" if place else what).split())
 
 
 def _known_keys(location) -> list[str]:
     tables = {"hand": _Hand, "finger1": _Finger, "finger2": _Finger, "object": _Object, "start": _Start}
-    tables |= {"phase": _Phase, "friction": _Frictions, "_Frictions": _Frictions}
-    names = [part for part in location if isinstance(part, str)]
+    tables |= {"phase": _Phase, "friction": _Frictions}
+    names = [part for part in location if isinstance(part, str) and part != _SEVERAL]
     return list(tables.get(names[-1], _Scene).model_fields) if names else list(_Scene.model_fields)
 
 

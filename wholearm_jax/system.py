@@ -55,9 +55,8 @@ def configuration_unit(length: Float[Array, ""]) -> Float[Array, "5"]:
 
 
 def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Formation) -> System:
-    """Scale a formation by the object's size and mass. The units are constants to differentiation."""
-    length = jax.lax.stop_gradient(jnp.sqrt((body.vertices**2).sum(1).max()))
-    mass = jax.lax.stop_gradient(body.mass)
+    """Scale a formation by the object's size and mass."""
+    length, mass = jnp.sqrt((body.vertices**2).sum(1).max()), body.mass
     rotary = mass * length**2
     small_body = Body(body.vertices / length, body.count, body.mass / mass, body.inertia / rotary, body.friction)
     small_hand = Hand(

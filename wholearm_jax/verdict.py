@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.margin import Score
+from wholearm_jax.forces import Score
 from wholearm_jax.motion import Motion
 from wholearm_jax.reduction import Table
 from wholearm_jax.status import Status

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.motion import Motion, acceleration
+from wholearm_jax.motion import Integration, Motion, acceleration, single_step
 from wholearm_jax.reduction import Table, horner, powers
 from wholearm_jax.schedule import Window, torque_in
 
@@ -107,8 +107,12 @@ def sampled_forces(table: Table, seen: Window, duration, steps: Arcs, samples: i
     return jnp.where((steps.live & ~steps.held)[:, None, None], values, jnp.inf)
 
 
-def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion) -> Score:
-    """The margin of a simulated phase."""
+def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion, how: Integration) -> Score:
+    """The margin of a simulated phase.
+
+    The quintics find the place; the force there comes from one step of the solver that ends on it, so that the margin
+    is as accurate as the integration.
+    """
     steps = arcs(table, seen, duration, motion)
     values = stop_gradient(sampled_forces(table, seen, duration, steps))
     per_step = values.min(1)
@@ -124,8 +128,11 @@ def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion
             return forces_on(*fixed, xi)[contact]
 
         xi = _minimise(one, seat, 1.0 / (SAMPLES - 1))
-        here = forces_on(table, seen, duration, arc, xi)[contact]
-        share, s, _ = on_arc(arc, xi)
+        length = xi * (arc.share[1] - arc.share[0])
+        begin = jnp.stack([arc.quintic[0], motion.entry_w[step]])
+        s, w = single_step(table, seen, duration, how, arc.piece, arc.row, arc.share[0], begin, length)
+        share = arc.share[0] + length
+        here = force(table, seen, duration, arc.piece, arc.row, share, s, w)[contact]
         return jnp.where(arc.live & ~arc.held, here, jnp.inf), share, s, contact
 
     margin, share, s, contact = jax.vmap(refine)(lowest)

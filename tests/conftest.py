@@ -1,0 +1,5 @@
+"""Every test computes in 64 bits."""
+
+import jax
+
+jax.config.update("jax_enable_x64", True)

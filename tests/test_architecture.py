@@ -1,0 +1,57 @@
+"""The package is read top to bottom: each module imports only from those above it; shapes decide what compiles."""
+
+import ast
+from pathlib import Path
+
+import jax
+
+import wholearm_jax as wa
+from wholearm_jax import plan
+
+PACKAGE = Path(wa.__file__).parent
+ORDER = (
+    *("status", "scene", "contacts", "system", "newton", "wire", "reduction", "schedule", "motion", "forces"),
+    *("verdict", "plan", "squeeze", "descent", "optimiser", "baseline"),
+    *("writing", "scene_file", "result_file", "drawing", "__init__", "command"),
+)
+
+
+def imports(path):
+    """Names of the package's own modules that a file imports anywhere in it."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("wholearm_jax"):
+            yield node.module.partition(".")[2] or "__init__"
+
+
+def test_each_module_imports_only_from_those_above_it():
+    assert {p.stem for p in PACKAGE.glob("*.py")} == set(ORDER)
+    for place, name in enumerate(ORDER):
+        below = set(imports(PACKAGE / f"{name}.py")) - set(ORDER[:place])
+        assert not below, f"{name} imports {below} from below"
+
+
+def test_matplotlib_stays_in_the_drawing_module_and_the_command_line():
+    for path in PACKAGE.glob("*.py"):
+        if path.stem not in ("drawing", "command"):
+            assert "matplotlib" not in path.read_text(), path.stem
+
+
+def test_the_public_interface_is_small():
+    assert len(wa.__all__) < 20
+    assert all(hasattr(wa, name) for name in wa.__all__)
+
+
+def test_scenes_of_one_size_share_their_programs():
+    """Heptagon and hexagon, four formations in all: trace, reduce and simulate compile once each."""
+    compiled = {}
+
+    def count(name, *_, **__):
+        compiled[name] = compiled.get(name, 0) + 1
+
+    for name in ("heptagon", "hexagon"):
+        scene = wa.load(name)
+        with jax.log_compiles(False):
+            wa.simulate(scene, wa.quasistatic(scene))
+        sizes = (plan.prepare._cached._cache_size(), plan.run._cached._cache_size())
+        count(sizes)
+    assert len(compiled) == 1, f"the second scene compiled again: {compiled}"

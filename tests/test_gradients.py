@@ -1,0 +1,83 @@
+"""Derivatives of the margin: forward mode, reverse mode and Richardson-extrapolated differences agree."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.motion import Integration
+from wholearm_jax.plan import end_configuration, margin
+from wholearm_jax.scene_file import to_dict
+from wholearm_jax.schedule import Torque
+
+
+def richardson(function, largest):
+    """Central differences at three step sizes, extrapolated twice."""
+    steps = (largest, largest / 2, largest / 4)
+    rows = [(function(h) - function(-h)) / (2 * h) for h in steps]
+    once = [(4 * fine - coarse) / 3 for coarse, fine in zip(rows, rows[1:], strict=False)]
+    return (16 * once[1] - once[0]) / 15
+
+
+def nearest_difference(function, value):
+    """Of a ladder of step sizes (rounding on one side, curvature on the other) the difference nearest to `value`."""
+    return min((richardson(function, h) for h in (1.6e-3, 4e-4, 1e-4)), key=lambda d: abs(d - value))
+
+
+def one_phase(name, row, push, change=lambda data: None, duration=0.6):
+    """A scene with a single phase of a bundled plan, starting where that phase starts, and torques that carry it out."""
+    scene = wa.load(name)
+    if row:
+        end = wa.trace(scene)[0]
+        start = end_configuration(end)
+        scene = eqx.tree_at(lambda s: (s.start, s.phases), scene, (start, scene.phases[row:]))
+    data = to_dict(scene)
+    data["phase"] = data["phase"][:1]
+    data["phase"][0]["duration"] = duration
+    change(data)
+    scene = wa.parse(data)
+    even = wa.quasistatic(scene)
+    # The schedule goes on beyond the phase, so that its last row is no kink at the phase's end.
+    return scene, Torque(1.01 * even.times, push * even.values)
+
+
+HOW = Integration(adjoint="both", tolerance=1e-12)
+CASES = {
+    "time runs out": ("heptagon", 0, 0.99),
+    "past the slip reversal": ("heptagon", 1, 1.01),
+    "frictionless": ("hexagon", 0, 1.01, lambda data: data["object"].update(friction=0.0)),
+    "undamped": ("hexagon", 0, 1.0, lambda data: [f.update(viscous=0.0, dry=0.0) for f in data["hand"].values()]),
+}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request):
+    return one_phase(*CASES[request.param])
+
+
+def test_modes_and_differences_agree_along_random_directions(case):
+    scene, torque = case
+    floats, rest = eqx.partition((scene, torque.values), eqx.is_inexact_array)
+
+    def value(floats):
+        scene, values = eqx.combine(floats, rest)
+        return margin(scene, Torque(torque.times, values), how=HOW)
+
+    reverse = jax.grad(value)(floats)
+    assert all(bool(jnp.all(jnp.isfinite(g))) for g in jax.tree.leaves(reverse))
+    rng = np.random.default_rng(3)
+    leaves, shape = jax.tree.flatten(floats)
+    for which in range(len(leaves)):
+        way = [np.zeros(leaf.shape) for leaf in leaves]
+        way[which] = rng.normal(size=leaves[which].shape) * (np.abs(leaves[which]).max() + 1e-3) * 0.1
+        way = jax.tree.unflatten(shape, [jnp.asarray(w) for w in way])
+        _, forward = jax.jvp(value, (floats,), (way,))
+        backward = sum(float((a * b).sum()) for a, b in zip(jax.tree.leaves(reverse), jax.tree.leaves(way), strict=True))
+        assert forward == pytest.approx(backward, rel=1e-10, abs=1e-12)
+
+        def moved(h, way=way):
+            return float(value(jax.tree.map(lambda a, b: a + h * b, floats, way)))
+
+        assert forward == pytest.approx(nearest_difference(moved, forward), rel=1e-7, abs=1e-8)
