@@ -1,5 +1,7 @@
 """Derivatives of the margin: forward mode, reverse mode and Richardson-extrapolated differences agree."""
 
+from itertools import pairwise
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,7 @@ def richardson(function, largest):
     """Central differences at three step sizes, extrapolated twice."""
     steps = (largest, largest / 2, largest / 4)
     rows = [(function(h) - function(-h)) / (2 * h) for h in steps]
-    once = [(4 * fine - coarse) / 3 for coarse, fine in zip(rows, rows[1:], strict=False)]
+    once = [(4 * fine - coarse) / 3 for coarse, fine in pairwise(rows)]
     return (16 * once[1] - once[0]) / 15
 
 
@@ -27,7 +29,7 @@ def nearest_difference(function, value):
 
 
 def one_phase(name, row, push, change=lambda data: None, duration=0.6):
-    """A scene with a single phase of a bundled plan, starting where that phase starts, and torques that carry it out."""
+    """A scene with one phase of a bundled plan, starting where that phase starts, and torques that carry it out."""
     scene = wa.load(name)
     if row:
         end = wa.trace(scene)[0]
@@ -74,10 +76,12 @@ def test_modes_and_differences_agree_along_random_directions(case):
         way[which] = rng.normal(size=leaves[which].shape) * (np.abs(leaves[which]).max() + 1e-3) * 0.1
         way = jax.tree.unflatten(shape, [jnp.asarray(w) for w in way])
         _, forward = jax.jvp(value, (floats,), (way,))
-        backward = sum(float((a * b).sum()) for a, b in zip(jax.tree.leaves(reverse), jax.tree.leaves(way), strict=True))
+        backward = sum(
+            float((a * b).sum()) for a, b in zip(jax.tree.leaves(reverse), jax.tree.leaves(way), strict=True)
+        )
         assert forward == pytest.approx(backward, rel=1e-10, abs=1e-12)
 
         def moved(h, way=way):
-            return float(value(jax.tree.map(lambda a, b: a + h * b, floats, way)))
+            return float(value(jax.tree.map(lambda start, step: start + h * step, floats, way)))
 
         assert forward == pytest.approx(nearest_difference(moved, forward), rel=1e-7, abs=1e-8)

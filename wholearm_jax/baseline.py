@@ -84,15 +84,17 @@ def _raise(table, share: float, longest: float) -> tuple[np.ndarray, float, Stat
     pull = np.asarray(_coefficients(table, table.breaks[0])[0])[3:]
     # The pushing finger is the one whose torque, raised in its own direction, accelerates the object more.
     pushing = int(np.argmax(pull * np.sign(torque)))
-    kept = None
-    for count in range(1, MOST + 1):
+    kept: tuple[np.ndarray, float, Status, float] = (torque, longest, Status.STUCK, -np.inf)
+    count, going = 0, True
+    while going and count < MOST:
+        count += 1
         status, margin, end = _attempt(table, torque, longest)
-        if kept is None or (status is Status.OK, margin) > (kept[2] is Status.OK, -np.inf):
+        if (status is Status.OK, margin) > (kept[2] is Status.OK, -np.inf):
             kept = (torque, end, status, margin)
         opened = status is Status.CONTACT_LOST and kept[2] is Status.OK
         torque = np.where(np.arange(2) == pushing, STEP * torque, torque)
-        if opened or abs(torque[pushing]) > limit[pushing]:
-            break  # a contact opened: back by 10 %, which is the last one that worked
+        # Where a contact opens, back by 10 %: that is the last one that worked.
+        going = not opened and abs(torque[pushing]) <= limit[pushing]
     return *kept, count
 
 

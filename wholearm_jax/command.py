@@ -42,7 +42,7 @@ def main() -> None:
 
 def _keep_compiled() -> None:
     """Keep compiled programs in the user's cache folder, unless JAX has been told otherwise."""
-    if jax.config.jax_compilation_cache_dir is not None or "JAX_ENABLE_COMPILATION_CACHE" in os.environ:
+    if jax.config.read("jax_compilation_cache_dir") is not None or "JAX_ENABLE_COMPILATION_CACHE" in os.environ:
         return
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     jax.config.update("jax_compilation_cache_dir", os.path.join(home, "wholearm_jax"))
@@ -244,6 +244,8 @@ def _draw(result, folder: Path) -> None:
     import matplotlib
 
     matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
     from wholearm_jax.drawing import draw_result, draw_strip
     from wholearm_jax.plan import trajectory
     from wholearm_jax.writing import write_whole
@@ -255,7 +257,7 @@ def _draw(result, folder: Path) -> None:
             buffer = io.BytesIO()
             figure.savefig(buffer, format=kind, dpi=150, bbox_inches="tight")
             write_whole(folder / f"{name}.{kind}", buffer.getvalue())
-        matplotlib.pyplot.close(figure)
+        plt.close(figure)
 
 
 if __name__ == "__main__":

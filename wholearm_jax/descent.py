@@ -89,10 +89,10 @@ def barrier(p, table: Table, limits: Limits):
     """`-sum log` of the room within torque, rate and duration limits, each group weighing one."""
     values, duration = p[:-1].reshape(-1, 2), jnp.exp(p[-1])
     knots = values.shape[0]
-    step = limits.rate / table.torque_limit * duration / (knots - 1)
-    bounded = jnp.isfinite(step)
-    climb = jnp.where(bounded, jnp.diff(values, axis=0) / jnp.where(bounded, step, 1.0), 0.0)
-    room = jnp.concatenate([1 - values**2, 1 - climb**2]) / knots * knots
+    bounded = jnp.isfinite(limits.rate)
+    step = jnp.where(bounded, limits.rate, 1.0) / table.torque_limit * duration / (knots - 1)
+    climb = jnp.where(bounded, jnp.diff(values, axis=0) / step, 0.0)
+    room = jnp.concatenate([1 - values**2, 1 - climb**2])
     span = jnp.log(limits.longest / limits.shortest)
     free = span > 0
     ends = jnp.stack([p[-1] - jnp.log(limits.shortest), jnp.log(limits.longest) - p[-1]]) / jnp.where(free, span, 1.0)
@@ -117,20 +117,29 @@ def linearise(p, table: Table, limits: Limits, temperature, how: Integration) ->
     middle = curve @ rows
     metric = (rows * curve[:, None]).T @ rows - jnp.outer(middle, middle) / curve.sum()
     metric, pull_back, backward = _keep_moving(metric, pace, weights, pace_rows, temperature)
-    wall, pull, bend = barrier(p, table, limits), jax.grad(barrier)(p, table, limits), jax.hessian(barrier)(p, table, limits)
+    wall, pull, bend = (
+        barrier(p, table, limits),
+        jax.grad(barrier)(p, table, limits),
+        jax.hessian(barrier)(p, table, limits),
+    )
     still = jnp.concatenate([jnp.repeat(limits.pinned, 2), (limits.longest <= limits.shortest)[None]])
     gradient = jnp.where(still, 0.0, -share @ rows + temperature * pull - pull_back)
     metric = jnp.where(still[:, None] | still[None], 0.0, metric + temperature * bend)
     metric = metric + jnp.diag(jnp.where(still, 1.0, 1e-9 * jnp.trace(metric) / p.shape[0]))
-    return Linear(-value + temperature * wall + backward, gradient, metric, arrival, jnp.where(still, 0.0, arrival_rows))
+    return Linear(
+        -value + temperature * wall + backward, gradient, metric, arrival, jnp.where(still, 0.0, arrival_rows)
+    )
 
 
 def _keep_moving(metric, pace, weights, rows, temperature):
     """Add the barrier `-T sum w log(speed)` to a metric; its gradient's negative and its value."""
     each = temperature * weights[..., 0]
+    # A start may turn back: there the loss is infinite (see `merit`), and the gradient still has to point forward.
+    backward = -(each * jnp.log(pace)).sum()
+    pace = jnp.maximum(pace, 1e-3)
     rows = rows.reshape(-1, rows.shape[-1])
     pull = (each / pace).ravel()
-    return metric + (rows * (each / pace**2).ravel()[:, None]).T @ rows, pull @ rows, -(each * jnp.log(pace)).sum()
+    return metric + (rows * (each / pace**2).ravel()[:, None]).T @ rows, pull @ rows, backward
 
 
 def merit(p, table: Table, limits: Limits, temperature, how: Integration):
@@ -180,7 +189,9 @@ class Advance(NamedTuple):
 
 
 @eqx.filter_jit
-def advance(p, state, linear: Linear, table: Table, limits: Limits, temperature, how: Integration, optimiser) -> Advance:
+def advance(
+    p, state, linear: Linear, table: Table, limits: Limits, temperature, how: Integration, optimiser
+) -> Advance:
     """One step of an optax optimiser, shortened until it lowers the loss after its return to the arrival.
 
     The return is Newton's method on the arrival error with the rows of `linear`, by least changes in its metric.

@@ -1,7 +1,5 @@
 """Figures: the plan as a strip of poses, the torques, the contact forces. Each draws on given axes and returns them."""
 
-from collections.abc import Sequence
-
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
@@ -34,33 +32,38 @@ def draw_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbe
         ends = np.stack([base, base + lengths[k] * way])
         ax.plot(*ends.T, color=COLOURS[k], lw=2.5, solid_capstyle="round")
         ax.plot(*joint, "o", color=COLOURS[k], ms=4)
-    ax.plot(*z[:2], "+", color=_INK, ms=5)
+    ax.plot(z[0], z[1], "+", color=_INK, ms=5)
     if numbers:
         for k, (corner, at) in enumerate(zip(corners, outline, strict=True)):
-            inward = -corner / np.hypot(*corner) * 0.18 * np.abs(corners).max()
+            inward = -corner / np.hypot(*corner) * 0.3 * np.abs(corners).max()
             turned = np.array([c * inward[0] - s * inward[1], s * inward[0] + c * inward[1]])
-            ax.text(*(at + turned), str(k), ha="center", va="center", fontsize=6, color=_INK)
+            x, y = at + turned
+            ax.text(x, y, str(k), ha="center", va="center", fontsize=6, color=_INK, zorder=6)
     ax.set_aspect("equal")
     ax.axis("off")
     ax.set_title(label, fontsize=8)
     return ax
 
 
-def draw_strip(result: Result, poses: int = 4, axes: Sequence[Axes] | None = None) -> Figure:
-    """The plan as a strip of poses (as the paper's figs. 2 and 3): `poses` for each phase, in the order of time."""
+def draw_strip(result: Result, poses: int = 4) -> Figure:
+    """The plan as strips of poses (as the paper's figs. 2 and 3): one row a phase, time running to the right."""
     courses = trajectory(result)
-    shown = []
-    for phase, course in zip(result.phases, courses, strict=False):
-        rows = np.linspace(0, len(course.time) - 1, poses).round().astype(int)
-        shown += [(phase.name, float(course.time[k]), np.asarray(course.z[k])) for k in rows]
-    if axes is None:
-        figure, grid = plt.subplots(1, len(shown), figsize=(1.6 * len(shown), 2.0), sharex=True, sharey=True, squeeze=False)
-        axes = list(grid[0])
-    figure = axes[0].figure
-    for k, (ax, (name, time, z)) in enumerate(zip(axes, shown, strict=True)):
-        draw_pose(result.scene, z, ax, label=f"{time:.2f} s", numbers=k == 0)
-        if k % poses == 0:
-            ax.text(0.0, -0.08, name, transform=ax.transAxes, fontsize=8, style="italic", color=_INK)
+    rows = max(len(courses), 1)
+    size = (1.7 * poses, 1.75 * rows)
+    figure, grid = plt.subplots(
+        rows, poses, figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained"
+    )
+    for row, (phase, course) in enumerate(zip(result.phases, courses, strict=False)):
+        shown = np.linspace(0, len(course.time) - 1, poses).round().astype(int)
+        for column, (ax, k) in enumerate(zip(grid[row], shown, strict=True)):
+            label = f"t = {float(course.time[k]):.2f} s"
+            draw_pose(result.scene, course.z[k], ax, label=label, numbers=row == 0 and column == 0)
+        at = {"transform": grid[row, 0].transAxes, "rotation": 90, "va": "center", "ha": "right"}
+        grid[row, 0].text(-0.04, 0.5, phase.name, fontsize=9, style="italic", color=_INK, **at)
+    if not courses:
+        draw_pose(result.scene, result.scene.start, grid[0, 0], label=result.status.label)
+        for ax in grid[0, 1:]:
+            ax.axis("off")
     return figure
 
 
@@ -70,6 +73,9 @@ def draw_torques(result: Result, ax: Axes | None = None) -> Axes:
     times, values = np.asarray(result.torque.times), np.asarray(result.torque.values)
     for k in range(2):
         ax.plot(times, values[:, k], color=COLOURS[k], ls=STYLES[k], label=f"finger {k + 1}")
+        limit = float(result.scene.hand.torque_limit[k])
+        for sign in (1, -1):
+            ax.axhline(sign * limit, color=COLOURS[k], lw=0.6, ls=":")
     ax.set_ylabel("joint torque [N m]")
     _finish(ax, result)
     return ax
@@ -93,8 +99,9 @@ def draw_forces(result: Result, ax: Axes | None = None) -> Axes:
         ax.annotate(
             f"margin {worst.margin:.3g} N, {worst.margin_contact}",
             (worst.margin_time, worst.margin),
-            xytext=(-6 if left else 6, -12),
+            xytext=(-8 if left else 8, 10),
             textcoords="offset points",
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.85},
             ha="right" if left else "left",
             fontsize=8,
         )
@@ -117,12 +124,16 @@ def _colour(result: Result, name: str):
     """A colour and a line style for each contact of the plan."""
     names = list(dict.fromkeys(n for phase in result.phases for n in phase.contacts))
     k = names.index(name)
-    return (*COLOURS, "#E69F00", "#56B4E9", "#000000", "#8B6914")[k % 8], STYLES[k // 4 % 4]
+    return ("#000000", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#8B6914", "#0072B2", "#D55E00")[k % 8], STYLES[
+        k // 4 % 4
+    ]
 
 
 def _finish(ax: Axes, result: Result) -> None:
-    for phase in result.phases[1:]:
+    for phase in result.phases:
         ax.axvline(phase.start, color=_PALE, lw=0.8, ls=":")
+        middle, over = phase.start + phase.duration / 2, ax.get_xaxis_transform()
+        ax.text(middle, 1.01, phase.name, transform=over, ha="center", va="bottom", fontsize=8, style="italic")
     ax.axhline(0, color=_INK, lw=0.6)
     ax.set_xlabel("time [s]")
     ax.spines[["top", "right"]].set_visible(False)

@@ -99,7 +99,9 @@ def forces_on(table: Table, seen: Window, duration, arc: Arcs, xi) -> Float[Arra
     return force(table, seen, duration, arc.piece, arc.row, share, s, w)
 
 
-def sampled_forces(table: Table, seen: Window, duration, steps: Arcs, samples: int = SAMPLES) -> Float[Array, "steps samples contacts"]:
+def sampled_forces(
+    table: Table, seen: Window, duration, steps: Arcs, samples: int = SAMPLES
+) -> Float[Array, "steps samples contacts"]:
     """Forces at evenly spaced places of every step, its two ends included; infinite where nothing moves."""
     xi = jnp.linspace(0.0, 1.0, samples, dtype=steps.quintic.dtype)
     at = jax.vmap(jax.vmap(forces_on, (None, None, None, None, 0)), (None, None, None, 0, None))
@@ -144,8 +146,9 @@ def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion
 def smooth_margin(values, weights, temperature: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     r"""The smooth loss's counterpart of `min values`: `phi = max_m [ m + T sum_i w_i log((values_i - m) / T) ]`.
 
-    `T` is the temperature [N] and `w` non-negative weights; `m`, returned second, solves `sum_i T w_i / (values_i - m) = 1`
-    and lies between `min - T sum(w)` and `min`. `phi` is concave in the values and its gradient `T w_i / (values_i - m)`
+    `T` is the temperature [N] and `w` non-negative weights; `m`, returned second, solves
+    `sum_i T w_i / (values_i - m) = 1` and lies between `min - T sum(w)` and `min`. `phi` is concave in the values and
+    its gradient `T w_i / (values_i - m)`
     sums to one. Entries of zero weight are left out.
     """
     live = stop_gradient(weights) > 0

@@ -225,6 +225,7 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
 
     solution = _integrate(table, seen, duration, how, state, final, goal, floor)
     y0 = jnp.stack([state.s, state.w])
+    saved_times, saved = jnp.asarray(solution.ts), jnp.asarray(solution.ys)
     taken = solution.stats["num_accepted_steps"]
     overshot = dfx.is_event(solution.result)
     complete = dfx.is_successful(solution.result) | overshot
@@ -232,8 +233,8 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     kept = jnp.where(overshot, taken - 1, taken)
     live = rows < kept
     # Unused rows are infinite: put numbers there before anything is computed from them.
-    times = jnp.where(live, solution.ts, state.share)
-    steps = jnp.where(live[:, None], solution.ys, y0)
+    times = jnp.where(live, saved_times, state.share)
+    steps = jnp.where(live[:, None], saved, y0)
     start = state.count
     place = jnp.where(live, start + 1 + rows, how.max_steps + 1)
     nodes = state.nodes.at[place].set(jnp.concatenate([times[:, None], steps], axis=1), mode="drop")
@@ -245,8 +246,8 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
         count=start + kept,
     )
     share, s, w = (nodes[start + kept, k] for k in range(3))
-    last_time = jnp.where(overshot, solution.ts[jnp.maximum(taken - 1, 0)], 1.0)
-    last_y = jnp.where(overshot, solution.ys[jnp.maximum(taken - 1, 0)], y0 * 0 + 1.0)
+    last_time = jnp.where(overshot, saved_times[jnp.maximum(taken - 1, 0)], 1.0)
+    last_y = jnp.where(overshot, saved[jnp.maximum(taken - 1, 0)], y0 * 0 + 1.0)
     passed = overshot & (last_y[0] > goal)
     landed = _land(table, seen, duration, how, state.piece, (share, s, w), last_time, goal, passed, overshot)
     land_share, land_s, land_w = landed
@@ -304,6 +305,7 @@ def _integrate(table, seen, duration, how, state, final, goal, floor):
     if how.adjoint in ("none", "forward"):
         return solve(inputs, adaptive(knots), how.adjoint)
     ends = solve(stop_gradient(inputs), adaptive(stop_gradient(knots)), "none").ts
+    assert ends is not None
     ends = jnp.where(jnp.isfinite(ends), ends, stop_gradient(final))
     # A step that ends on a knot moves with it; the next begins behind the knot where the torque may step there.
     knot = knots[jnp.argmin(jnp.abs(ends[:, None] - stop_gradient(knots)), axis=1)]

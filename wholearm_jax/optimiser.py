@@ -28,6 +28,7 @@ FIRST = 0.9  # share of the torque limits that the start may use
 PROFILES = tuple((p, q) for p in (1.0, 2.0, 4.0, 8.0, 16.0) for q in (1.0, 2.0, 4.0, 8.0, 16.0))
 FINE = 8  # places a knot interval at which a starting motion is judged
 EVEN = 0.3  # share of the even motion in every profile, so that the object never quite stops on the way
+SMOOTHINGS = 2000  # most passes that bring a start within its rate limits
 PATIENCE = 12  # steps without gain at the lowest temperature before a phase stops
 
 
@@ -60,22 +61,24 @@ class Optimised:
 
     @property
     def reached(self) -> tuple[float, ...]:
-        """The share of its bound that each phase reached."""
-        return tuple(p.margin / float(b.value) for p, b in zip(self.result.phases, self.bounds, strict=True))
+        """The share of its bound that each phase reached; NaN where the bound is not positive."""
+        pairs = zip(self.result.phases, self.bounds, strict=True)
+        return tuple(p.margin / float(b.value) if float(b.value) > 0 else float("nan") for p, b in pairs)
 
 
 def quasistatic(scene: Scene, *, knots: int = 31, traced: tuple[Traced, ...] = ()) -> Torque:
     """The quasi-static torques: at each knot the best squeeze for an even rest-to-rest motion, in closed form.
 
     The motion's speed is `v ~ u^p (1 - u)^q` in `u = t / duration`: the even `p = q = 1` unless another of `PROFILES`
-    allows a larger margin. As the inverse dynamics at the knots only, the schedule carries the object near the wire's end, not exactly to it.
+    allows a larger margin. As the inverse dynamics at the knots only, the schedule carries the object near the wire's
+    end, not exactly to it.
     """
     traced = traced or trace(scene)
     return _joined(scene, [_start(at, p.duration, knots, 1.0) for at, p in zip(traced, scene.phases, strict=True)])
 
 
 def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...]:
-    """For each phase the certificate that no torque within limits holds it with a larger margin (see `squeeze.bound`)."""
+    """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.bound`)."""
     traced = traced or trace(scene)
     pairs = zip(traced, scene.phases, strict=True)
     return tuple(_bound(at.table, p.duration, jnp.asarray(p.arrive == "rest")) for at, p in pairs)
@@ -138,7 +141,11 @@ def _optimise_phase(task: _Task, limits: Limits, optimiser, callback) -> tuple[T
     """Descend on one phase; return the best schedule (from time 0), why it stopped, and the steps taken."""
     table, how = task.traced.table, Integration(max_steps=128, adjoint="forward")
     if int(table.status) != Status.OK:
-        return _evenly(task, np.zeros((task.knots, 2))), f"the wire cannot be followed: {Status(int(table.status)).label}", []
+        return (
+            _evenly(task, np.zeros((task.knots, 2))),
+            f"the wire cannot be followed: {Status(int(table.status)).label}",
+            [],
+        )
     values = _start(task.traced, task.duration, task.knots, FIRST)
     if task.bound <= 0:
         why = f"no torque within limits holds this formation at {100 * task.bound_share:.0f} % of its wire"
@@ -238,12 +245,14 @@ def _limits(task: _Task, rate_limit, durations) -> Limits:
 
 
 def _within_rate(values, limits: Limits, task: _Task):
-    """The nearest knots, taken in order, that keep 90 % of the rate limit."""
-    largest = 0.9 * np.asarray(limits.rate) * float(task.duration) / (task.knots - 1)
-    rows = [values[0]]
-    for row in values[1:]:
-        rows.append(np.clip(row, rows[-1] - largest, rows[-1] + largest))
-    return np.stack(rows)
+    """The knots smoothed until they keep 80 % of the rate limit; the first stays where it is."""
+    largest = 0.8 * np.asarray(limits.rate) * float(task.duration) / (task.knots - 1)
+    for _ in range(SMOOTHINGS):
+        if np.all(np.abs(np.diff(values, axis=0)) <= largest):
+            break
+        values = np.concatenate([values[:1], (values[:-2] + 2 * values[1:-1] + values[2:]) / 4, values[-1:]])
+        values[-1] = values[-2]
+    return values
 
 
 def _joined(scene: Scene, blocks) -> Torque:
@@ -259,5 +268,3 @@ def _joined(scene: Scene, blocks) -> Torque:
 def replace_duration(phase, duration):
     """A phase with another duration."""
     return eqx.tree_at(lambda p: p.duration, phase, jnp.asarray(duration, float))
-
-

@@ -23,6 +23,8 @@ from wholearm_jax.system import system
 from wholearm_jax.verdict import Verdict, judge
 from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
 
+CONTINUITY = 1e-6  # metres and radians by which a phase may begin beside the end of the one before it
+
 
 class Traced(NamedTuple):
     """A phase's wire and its table."""
@@ -85,7 +87,8 @@ class Result:
     @property
     def message(self) -> str:
         """What became of the plan, in one line."""
-        return next((p.message for p in self.phases if p.status is not Status.OK), "ok, margin %.4g N" % self.margin)
+        failed = (p.message for p in self.phases if p.status is not Status.OK)
+        return next(failed, f"ok, margin {self.margin:.4g} N")
 
 
 @eqx.filter_jit
@@ -126,16 +129,35 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     solid, rough, found = _body(scene.object), scene.start, []
     for phase in scene.phases:
         traced = _refined(solid, scene, phase, rough, resolution, tolerance)
-        found.append(traced)
+        found.append(_joined(traced, rough) if found else traced)
         rough = end_configuration(traced)
     return tuple(found)
+
+
+@jax.jit
+def _joined(traced: Traced, rough) -> Traced:
+    """Refuse a phase whose formation does not hold where the phase before it ended."""
+    panel, xi = powers(traced.table, jnp.asarray(0), traced.table.breaks[0])
+    apart = jnp.abs(horner(traced.table.configuration[panel], xi) - rough).max()
+    status = traced.table.status
+    open_there = (status == 0) & ~(apart < CONTINUITY)
+    return eqx.tree_at(lambda t: t.table.status, traced, jnp.where(open_there, int(Status.NO_CONVERGENCE), status))
+
+
+def _concrete(value) -> bool:
+    """Whether an array holds numbers now, rather than standing for them in a transformation."""
+    try:
+        float(value)
+    except jax.errors.ConcretizationTypeError:
+        return False
+    return True
 
 
 def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, tolerance: float) -> Traced:
     while True:
         traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, resolution)
         table = traced.table
-        if isinstance(table.error, jax.core.Tracer):
+        if not _concrete(table.error):
             return traced  # under a transformation shapes are fixed: the caller has chosen the resolution
         coarse = bool(table.error > tolerance) and int(table.status) == Status.OK
         full = int(table.count) >= resolution.pieces
@@ -159,7 +181,11 @@ def outcomes(scene: Scene, torque: Torque, traced: tuple[Traced, ...], how: Inte
 
 
 def margin(
-    scene: Scene, torque: Torque, *, how: Integration = Integration(adjoint="both"), resolution: Resolution = Resolution()
+    scene: Scene,
+    torque: Torque,
+    *,
+    how: Integration = Integration(adjoint="both"),
+    resolution: Resolution = Resolution(),
 ) -> Float[Array, ""]:
     """The compressive margin [N] of a plan: the least `c_n` over time and contacts, formations assumed to hold.
 
@@ -183,7 +209,9 @@ def simulate(
     total = sum(float(p.duration) for p in scene.phases)
     last = float(torque.times[-1])
     if float(torque.times[0]) > 0 or last < total * (1 - 1e-9):
-        raise ValueError(f"the torque schedule covers {float(torque.times[0]):g} to {last:g} s, the plan 0 to {total:g} s")
+        raise ValueError(
+            f"the torque schedule covers {float(torque.times[0]):g} to {last:g} s, the plan 0 to {total:g} s"
+        )
     traced = traced or trace(scene)
     stepped = any(has_steps(torque, start, end) for start, end in _spans(scene))
     while True:
@@ -278,7 +306,7 @@ def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shar
 
 
 def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
-    """Every phase at `samples` evenly spaced times; a phase that failed stops at its failure, later ones are left out."""
+    """Every phase at `samples` evenly spaced times; a phase that failed stops there, and later ones are left out."""
     found, schedule = [], _padded(result.torque)
     for phase in result.phases:
         if int(phase.traced.table.status) != Status.OK:
@@ -294,7 +322,7 @@ def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
 
 def require_x64() -> None:
     """Raise unless JAX computes in 64 bits: the statuses' tolerances need them."""
-    if not jax.config.jax_enable_x64:
+    if jnp.zeros(()).dtype != jnp.float64:
         raise RuntimeError(
             "this function needs float64; call jax.config.update('jax_enable_x64', True) before importing arrays"
         )

@@ -1,7 +1,7 @@
 r"""Reduce: the equations of motion on a wire as one scalar ODE and four contact forces.
 
-With `x = dz/ds`, `x' = d2z/ds2`, `v = ds/dt`, `a = dv/dt` the motion is `z_dot = x v`, `z_ddot = x a + x' v^2`, and at each
-`s` one 5x5 linear system gives everything (the paper's eqs. 1-4 and 12-16 in one line):
+With `x = dz/ds`, `x' = d2z/ds2`, `v = ds/dt`, `a = dv/dt` the motion is `z_dot = x v`, `z_ddot = x a + x' v^2`, and
+at each `s` one 5x5 linear system gives everything (the paper's eqs. 1-4 and 12-16 in one line):
 
     [ M x , -(G_n - Xi U G_t)^T ] [a ; c_n] = E tau + g - M x' v^2 - B x v - D sgn(x v)
 

@@ -6,7 +6,8 @@ given vertices.
 """
 
 import re
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 COORDINATES = ("x", "y", "phi", "theta1", "theta2")
 LINKS = ("palm", "finger1", "finger2")
 VERTEX, EDGE = 0, 1  # contact types: A, an object vertex on a link; B, a fingertip on an object edge
-_CONTACT = re.compile(r"(palm|finger1|finger2):([ve])(\d+)( rolling)?")
+_CONTACT = re.compile(r"(palm|finger1|finger2):([ve])([0-9]+)( rolling)?")
 
 
 class MassProperties(NamedTuple):
@@ -60,7 +61,7 @@ class Hand(eqx.Module):
 
 
 class Formation(eqx.Module):
-    """A contact formation as data: for each contact the link (0 palm, 1, 2), the type (`VERTEX`, `EDGE`), its number."""
+    """A contact formation as data: each contact's link (0 palm, 1, 2), type (`VERTEX`, `EDGE`) and feature number."""
 
     link: Int[Array, "contacts"]
     kind: Int[Array, "contacts"]
@@ -142,7 +143,7 @@ def formation(contacts) -> Formation:
     return Formation(jnp.asarray(link), jnp.asarray(kind), jnp.asarray(feature), jnp.asarray(rolling))
 
 
-def heading(toward: str, until: dict[str, float] | None = None) -> Heading:
+def heading(toward: str, until: Mapping[Any, float] | None = None) -> Heading:
     """Build a `Heading` from a coordinate and a sign (`"x-"`) and an optional `{coordinate: value}` to stop at."""
     coordinate, value = next(iter(until.items())) if until else (None, 0.0)
     return Heading(

@@ -181,7 +181,10 @@ class _Scene(_Strict):
     @model_validator(mode="after")
     def _known_features(self) -> Self:
         count = len(self.object.vertices)
+        names = [phase.name for phase in self.phase]
         for k, phase in enumerate(self.phase):
+            if phase.name in names[:k]:
+                raise ValueError(f"phase[{k}].name: '{phase.name}' stands twice; give each phase its own name")
             for text in phase.contacts:
                 if parse_contact(text)[2] >= count:
                     raise ValueError(f"phase[{k}].contacts: '{text}': the object has vertices 0 to {count - 1}")

@@ -132,11 +132,14 @@ def _best(table, offset, slope, pull, push):
     det = (triples[:, 0] * cross).sum(1)
     size = jnp.prod(jnp.sqrt((triples**2).sum(2)), axis=1)
     regular = jnp.abs(det) > 1e-9 * jnp.maximum(size, 1e-300)
-    meet = -(
-        q[:, :1] * cross
-        + q[:, 1:2] * jnp.cross(triples[:, 2], triples[:, 0])
-        + q[:, 2:] * jnp.cross(triples[:, 0], triples[:, 1])
-    ) / jnp.where(regular, det, 1.0)[:, None]
+    meet = (
+        -(
+            q[:, :1] * cross
+            + q[:, 1:2] * jnp.cross(triples[:, 2], triples[:, 0])
+            + q[:, 2:] * jnp.cross(triples[:, 0], triples[:, 1])
+        )
+        / jnp.where(regular, det, 1.0)[:, None]
+    )
     slack = meet @ p.T + constant
     allowed = 1e-9 * (jnp.abs(constant) + scale * jnp.abs(limit).max() + jnp.abs(meet[:, 2:]))
     feasible = regular & jnp.all(slack >= -allowed, axis=1)

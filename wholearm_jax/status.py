@@ -33,13 +33,13 @@ class Status(enum.IntEnum):
 
 _ADVICE = {
     Status.OK: "every contact stays in compression and the object arrives as planned",
-    Status.CONTACT_LOST: "a contact force turns tensile; squeeze harder, move more slowly, or optimise the torques",
+    Status.CONTACT_LOST: "a contact force turns tensile; squeeze harder, move more slowly, or optimise",
     Status.STUCK: "friction holds the object at rest; raise the torque that pushes it, or lower the squeeze",
     Status.REVERSED: "the object moves backward along its wire; raise the torque that pushes it",
     Status.NOT_REACHED: "time ran out before the object arrived; give the phase more time or more torque",
-    Status.LEFT_FORMATION: "the wire ends while the object still moves; brake earlier, or let the phase arrive moving",
-    Status.AMBIGUOUS: "friction allows forward and backward motion at once (Painleve); lower the friction or the squeeze",
-    Status.SINGULAR: "the equations of motion or the C-functions lose rank (wedging, fold or branch); change the formation",
-    Status.NO_CONVERGENCE: "Newton's method or the table did not reach its tolerance; check the start, or refine the table",
+    Status.LEFT_FORMATION: "the wire ends while the object moves, or the start is outside the formation; brake earlier",
+    Status.AMBIGUOUS: "friction allows both directions at once (Painleve); lower the friction or the squeeze",
+    Status.SINGULAR: "rank is lost (wedging, fold, branch), or `toward` names a still coordinate; change the phase",
+    Status.NO_CONVERGENCE: "Newton's method or the table did not converge; check the start, or refine the table",
     Status.MAX_STEPS: "the step limit was reached; raise it, or shorten the phase",
 }

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from wholearm_jax.contacts import Contacts, contacts, every_contact
-from wholearm_jax.scene import EDGE, Body, Formation, Hand
+from wholearm_jax.scene import EDGE, Body, Formation, Hand, next_vertex
 
 
 class System(eqx.Module):
@@ -31,6 +31,7 @@ class System(eqx.Module):
     length: Float[Array, ""]
     mass: Float[Array, ""]
     torque_limit: Float[Array, "2"]
+    convex: Bool[Array, ""]
 
     @property
     def configuration_unit(self) -> Float[Array, "5"]:
@@ -81,7 +82,16 @@ def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Format
         length=length,
         mass=mass,
         torque_limit=hand.torque_limit,
+        convex=_convex(body),
     )
+
+
+def _convex(body: Body) -> Bool[Array, ""]:
+    """Whether no corner of the object turns clockwise."""
+    following = next_vertex(body.count, body.vertices.shape[0])
+    edge = body.vertices[following] - body.vertices
+    turn = edge[:, 0] * edge[following, 1] - edge[:, 1] * edge[following, 0]
+    return jnp.all((turn >= 0) | (jnp.arange(turn.shape[0]) >= body.count))
 
 
 def _watched(pairs: Formation, formation: Formation, body: Body) -> Bool[Array, "candidates"]:

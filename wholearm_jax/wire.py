@@ -41,10 +41,10 @@ class Resolution(NamedTuple):
 class Wire(eqx.Module):
     """A traced wire in object units. Pieces beyond `count` are empty and lie at the wire's end.
 
-    Piece `k` covers `[breaks[k], breaks[k + 1]]` in the chart `chart[k]` about (`anchor[k]`, `anchor_s[k]`); `factor[k]`
-    is the ratio of `ds/dt` after entering the piece to that before. `slip_sign` (Xi) and `joint_sign` hold for forward
-    travel. Panels `first[k] ... first[k] + panels[k] - 1` belong to piece `k`; `nodes[p, i]` is `z` at node `i` of
-    panel `p`. `end_why` says why the wire ends and `end_contact` which contact is made (a row of
+    Piece `k` covers `[breaks[k], breaks[k + 1]]` in the chart `chart[k]` about (`anchor[k]`, `anchor_s[k]`), and
+    `factor[k]` is the ratio of `ds/dt` after entering the piece to that before. `slip_sign` (Xi) and `joint_sign` hold
+    for forward travel. Panels `first[k] ... first[k] + panels[k] - 1` belong to piece `k`; `nodes[p, i]` is `z` at node
+    `i` of panel `p`. `end_why` says why the wire ends and `end_contact` which contact is made (a row of
     `System.candidates`) or leaves its feature (a row of `System.contacts`).
     """
 
@@ -78,7 +78,8 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     """Project `rough` (SI) onto the formation and follow its wire as `heading` says, to its end.
 
     Never raises for a configuration that does not work: `Wire.status` says `no_convergence` (the contacts cannot all
-    touch near the start; `start_gaps` tells which stay open), `singular` (fold or branch), `max_steps` (no end within
+    touch near the start; `start_gaps` tells which stay open), `left_formation` (there a contact is beyond its feature,
+    or the object inside a link), `singular` (fold or branch), `max_steps` (no end within
     reach) or `ok`.
     """
     rough = rough / system.configuration_unit
@@ -94,8 +95,20 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     touching = residual < 100 * jnp.finfo(rough.dtype).eps
     direction = jnp.abs(first_tangent[heading.coordinate]) > 1e-6
     worst = jnp.select(
-        [~touching, ~direction, march.status > 0, places.failed | wire.status.astype(bool)],
-        [int(Status.NO_CONVERGENCE), int(Status.SINGULAR), march.status, int(Status.NO_CONVERGENCE)],
+        [
+            ~touching,
+            _misplaced(fixed, stop_gradient(start)),
+            ~direction,
+            march.status > 0,
+            places.failed | wire.status.astype(bool),
+        ],
+        [
+            int(Status.NO_CONVERGENCE),
+            int(Status.LEFT_FORMATION),
+            int(Status.SINGULAR),
+            march.status,
+            int(Status.NO_CONVERGENCE),
+        ],
         0,
     )
     return eqx.tree_at(
@@ -143,6 +156,17 @@ def _project(system, rough):
     root = newton(nearest, z, system, rough)
     near = jnp.where(root.residual < 1e-6, root.z, z)
     return near, jnp.abs(gaps(fixed.contacts, stop_gradient(near))).max()
+
+
+def _misplaced(system, z):
+    """Whether a contact lies beyond its feature, or a vertex behind the palm or (of a convex object) a finger."""
+    tolerance = jnp.finfo(z.dtype).eps ** 0.625
+    held, pairs = frames(system.contacts, z), frames(system.candidates, z)
+    beyond = (held.along < system.contacts.lower - tolerance) | (held.along > system.contacts.upper + tolerance)
+    inside = (pairs.along > system.candidates.lower) & (pairs.along < system.candidates.upper)
+    palm = system.candidates.finger.sum(1) == 0
+    behind = system.watched & system.candidates.on_link & inside & (pairs.gap < -tolerance)
+    return jnp.any(beyond) | jnp.any(behind & (palm | system.convex))
 
 
 def _null(rows):
@@ -204,7 +228,6 @@ def _march(system, heading, z, x):
         return jnp.zeros((MAX_MARCH, *row.shape), row.dtype).at[0].set(row)
 
     values, rates, along = watch(z, x, x)
-    zero = jnp.zeros((), z.dtype)
     begin = _March(
         n=jnp.asarray(1),
         step=jnp.asarray(LONGEST, z.dtype),
@@ -410,9 +433,7 @@ def _cut(system, fixed, march, places, start, resolution):
     entry = jnp.concatenate([start[None], places.z])
     before = jnp.concatenate([chart[:1], chart[:-1]])
     x_entry = jax.vmap(lambda z, u: tangent(system, z, u))(entry, before)
-    factor = jnp.where(
-        jnp.arange(resolution.pieces) < count, (chart * x_entry).sum(1) / (before * x_entry).sum(1), 1.0
-    )
+    factor = jnp.where(jnp.arange(resolution.pieces) < count, (chart * x_entry).sum(1) / (before * x_entry).sum(1), 1.0)
 
     first, panels, owner = _panels(stop_gradient(breaks), count, resolution)
     local = (jnp.arange(resolution.panels) - first[owner])[:, None] + (chebyshev(resolution.nodes) + 1) / 2

@@ -1,0 +1,94 @@
+"""The main job: optimised plans against the certified bound, their limits, and the search by steps of 10 %."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.plan import simulate
+from wholearm_jax.verdict import ARRIVAL
+
+# Largest minimum force [N] that direct collocation reached on the same plans at 1 s a phase, equal to the bound.
+BOUNDS = {"heptagon": (0.966, 0.838), "hexagon": (0.694, 1.830)}
+
+
+@pytest.fixture(scope="module", params=BOUNDS)
+def optimised(request):
+    scene = wa.load(request.param)
+    return request.param, scene, wa.optimise(scene)
+
+
+def test_every_phase_reaches_97_percent_of_the_bound(optimised):
+    name, _, found = optimised
+    for phase, top, known in zip(found.result.phases, found.bounds, BOUNDS[name], strict=True):
+        assert phase.status is wa.Status.OK
+        assert float(top.value) == pytest.approx(known, abs=6e-4)
+        assert phase.margin >= 0.97 * float(top.value)
+        assert phase.margin <= float(top.value) + 1e-9, "no torque can beat the bound"
+
+
+def test_the_schedule_alone_carries_the_plan_out_within_its_limits(optimised):
+    _, scene, found = optimised
+    assert float(jnp.abs(found.torque.values).max()) <= 1.0
+    again = simulate(scene, found.torque, tolerance=1e-12)
+    assert again.status is wa.Status.OK
+    assert again.margin == pytest.approx(found.result.margin, rel=1e-6)
+    for phase in again.phases:
+        motion, table = phase.outcome.motion, phase.traced.table
+        assert abs(float(motion.s[motion.count] - table.breaks[-1])) <= ARRIVAL * float(table.length)
+
+
+def test_history_says_what_happened(optimised):
+    _, _, found = optimised
+    assert len(found.stopped) == 2
+    assert all(found.stopped)
+    for row, phase in enumerate(found.result.phases):
+        good = [step.margin for step in found.history if step.phase == row and step.status is wa.Status.OK]
+        assert phase.margin == pytest.approx(max(good), rel=1e-9), "the best step is kept"
+
+
+def test_the_search_is_beaten_in_margin(optimised):
+    _, scene, found = optimised
+    baseline = wa.search(scene)
+    assert baseline.simulations > 10
+    for phase, top in zip(baseline.result.phases, found.bounds, strict=True):
+        assert phase.margin <= float(top.value) + 1e-9 or phase.status is not wa.Status.OK
+    assert baseline.result.status is not wa.Status.OK or baseline.result.margin < found.result.margin
+
+
+def test_rate_limits_hold_in_the_result():
+    scene = wa.load("hexagon")
+    scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
+    found = wa.optimise(scene, rate_limit=2.0, steps=40)
+    assert found.result.status is wa.Status.OK
+    rates = np.diff(np.asarray(found.torque.values), axis=0) / np.diff(np.asarray(found.torque.times))[:, None]
+    assert np.abs(rates).max() <= 2.0 + 1e-9
+
+
+def test_durations_are_free_within_their_range():
+    scene = wa.load("hexagon")
+    scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
+    fixed = wa.optimise(scene, steps=15)
+    free = wa.optimise(scene, durations=(0.5, 2.0), steps=15)
+    assert 0.5 <= float(free.scene.phases[0].duration) <= 2.0
+    assert float(free.scene.phases[0].duration) != pytest.approx(1.0, abs=1e-3)
+    assert free.result.margin >= 0.97 * fixed.result.margin
+
+
+def test_any_optax_optimiser_descends():
+    scene = wa.load("hexagon")
+    scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
+    found = wa.optimise(scene, optimiser=optax.adam(3e-3), steps=12)
+    good = [step.margin for step in found.history if step.status is wa.Status.OK]
+    assert max(good) > good[0]
+
+
+def test_a_formation_that_cannot_be_held_is_said_before_any_search():
+    scene = wa.load("heptagon")
+    weak = eqx.tree_at(lambda s: s.hand.torque_limit, scene, jnp.full(2, 0.02))
+    found = wa.optimise(weak)
+    assert found.history == ()
+    assert "no torque within limits" in found.stopped[0]
+    assert found.result.status is not wa.Status.OK
