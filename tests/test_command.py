@@ -1,0 +1,227 @@
+"""The command line: exit status 0 for ok, 1 for a plan that fails, 2 and one line for bad input."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+import tomli_w
+
+from wholearm_jax import command
+from wholearm_jax.scene_file import load, to_dict
+
+
+@pytest.fixture
+def wholearm(monkeypatch, capsys):
+    """Run the program in this process: arguments -> (exit status, standard output, standard error)."""
+    monkeypatch.setenv("JAX_ENABLE_COMPILATION_CACHE", "true")  # leave the user's cache folder alone
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["wholearm", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            command.main()
+        printed = capsys.readouterr()
+        return caught.value.code or 0, printed.out, printed.err
+
+    return run
+
+
+@pytest.fixture
+def zero(tmp_path):
+    """A schedule without torque, as long as the heptagon's plan."""
+    path = tmp_path / "zero.csv"
+    path.write_text("t,tau1,tau2\n0,0,0\n2,0,0\n")
+    return path
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    """Write a scene like the heptagon's: changes of its dictionary -> path."""
+
+    def write(change):
+        data = to_dict(load("heptagon"))
+        change(data)
+        path = tmp_path / "scene.toml"
+        path.write_text(tomli_w.dumps(data))
+        return path
+
+    return write
+
+
+def assert_bad_input(answer, *parts):
+    """Exit status 2, nothing on standard output, one line on standard error that names everything in `parts`."""
+    code, out, err = answer
+    assert code == 2
+    assert out == ""
+    assert err.startswith("wholearm: ")
+    assert err.count("\n") == 1
+    assert err.endswith("\n")
+    for part in parts:
+        assert str(part) in err
+
+
+# --- what works ------------------------------------------------------------------------------------------------------
+
+
+def test_scenes(wholearm):
+    code, out, err = wholearm("scenes")
+    assert code == 0
+    assert out.splitlines() == [
+        "heptagon: irregular heptagon; slide left, flip right",
+        "hexagon: hexagon; slide left, flip right",
+    ]
+    assert err == ""
+
+
+def test_help_lists_the_commands(wholearm):
+    code, out, _ = wholearm("--help")
+    assert code == 0
+    for name in ("optimise", "simulate", "search", "scenes"):
+        assert f"  {name} " in out
+
+
+def test_runs_as_a_program(tmp_path):
+    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "true"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-m", "wholearm_jax.command", "search", "heptagn"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == "wholearm: heptagn: no such file; did you mean the bundled scene 'heptagon'?\n"
+    assert os.listdir(tmp_path) == []
+
+
+# --- bad input -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["optimise", "simulate", "search"])
+def test_unknown_scene(name, wholearm, zero, tmp_path):
+    more = ["--torque", zero] if name == "simulate" else []
+    assert_bad_input(wholearm(name, tmp_path / "none.toml", *more), tmp_path / "none.toml", "no such file")
+
+
+@pytest.mark.parametrize("name", ["optimise", "simulate", "search"])
+def test_bad_scene_file(name, wholearm, zero, scene_file):
+    path = scene_file(lambda data: data["object"].update(mass=-1.0))
+    more = ["--torque", zero] if name == "simulate" else []
+    assert_bad_input(wholearm(name, path, *more), path, "object.mass", "greater than 0")
+
+
+def test_bad_torque_file(wholearm, tmp_path):
+    path = tmp_path / "torque.csv"
+    path.write_text("t,tau1,tau2\n0,0,0\n2,much,0\n")
+    assert_bad_input(wholearm("simulate", "heptagon", "--torque", path), path, "line 3", "not three numbers")
+
+
+def test_missing_torque_file(wholearm, tmp_path):
+    path = tmp_path / "torque.csv"
+    assert_bad_input(wholearm("simulate", "heptagon", "--torque", path), path, "no such file")
+
+
+@pytest.mark.parametrize("name", ["optimise", "simulate", "search"])
+def test_output_folder_that_is_a_file(name, wholearm, zero, tmp_path):
+    place = tmp_path / "out"
+    place.write_text("in the way")
+    more = ["--torque", zero] if name == "simulate" else []
+    assert_bad_input(wholearm(name, "heptagon", "--out", place, *more), "--out", place, "cannot be written")
+    assert place.read_text() == "in the way"
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ("slide right.duration=1", "phases: slide left, flip right"),
+        ("2.duration=1", "phases: slide left, flip right"),
+        ("\u00b2.duration=1", "phases: slide left, flip right"),
+        ("slide left.speed=1", "PHASE.duration=SECONDS"),
+        ("duration=1", "PHASE.duration=SECONDS"),
+        ("slide left.duration", "a positive number of seconds"),
+        ("slide left.duration=-1", "a positive number of seconds"),
+        ("slide left.duration=0", "a positive number of seconds"),
+        ("slide left.duration=nan", "a positive number of seconds"),
+        ("0.duration=inf", "a positive number of seconds"),
+        ("1.duration=soon", "a positive number of seconds"),
+    ],
+)
+def test_bad_changes(change, cause, wholearm):
+    assert_bad_input(wholearm("optimise", "heptagon", "--set", change), f"--set {change}: ", cause)
+
+
+def test_torque_file_shorter_than_the_plan(wholearm, zero):
+    answer = wholearm("simulate", "heptagon", "--torque", zero, "--set", "1.duration=1.5")
+    assert_bad_input(answer, zero, "covers 0 to 2 s, the plan 0 to 2.5 s")
+
+
+def spread(data):
+    data["hand"]["finger1"]["joint"], data["hand"]["finger2"]["joint"] = [1.0, 0.0], [-1.0, 0.0]
+
+
+def shorten(data):
+    data["hand"]["finger1"]["length"] = 0.02
+
+
+def overload(data):
+    data["phase"][0]["contacts"] = ["palm:v5", "palm:v6", "palm:v0", "finger2:v3"]
+
+
+def skip(data):
+    data["phase"][1]["contacts"] = ["palm:v6", "finger1:v0", "finger2:v3", "finger2:v4"]
+
+
+def stop_early(data):
+    data["phase"][0]["until"] = {"x": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "contact", "cause"),
+    [
+        (spread, "phase[0].contacts", "finger2:v3", "from this start"),
+        (shorten, "phase[0].contacts", "finger1:v1", "a gap of 0.0504 m stays open"),
+        (overload, "phase[0].contacts", "palm:v6", "from this start"),
+        (skip, "phase[1].contacts", "finger1:v0", "where phase 'slide left' ends"),
+        (stop_early, "phase[1].contacts", "finger2:v4", "where phase 'slide left' ends"),
+    ],
+)
+def test_contacts_that_cannot_all_touch(change, key, contact, cause, wholearm, zero, scene_file):
+    path = scene_file(change)
+    answer = wholearm("simulate", path, "--torque", zero)
+    assert_bad_input(answer, f"{path}: {key}: {contact} cannot touch", cause, "stays open")
+
+
+@pytest.mark.parametrize("name", ["optimise", "search"])
+def test_contacts_that_cannot_all_touch_stop_every_command(name, wholearm, scene_file):
+    path = scene_file(spread)
+    assert_bad_input(wholearm(name, path), f"{path}: phase[0].contacts: finger2:v3 cannot touch", "stays open")
+
+
+# --- plans that fail -------------------------------------------------------------------------------------------------
+
+
+def test_plan_that_fails(wholearm, zero, tmp_path):
+    out = tmp_path / "some" / "where"
+    code, printed, err = wholearm("simulate", "heptagon", "--torque", zero, "--out", out, "--samples", 5)
+    assert code == 1
+    assert err == ""
+    assert printed.startswith("slide left: stuck, t = 1 s")
+    assert {"torque.csv", "trajectory.csv", "summary.json", "plan.png", "result.svg"} <= set(os.listdir(out))
+    assert not [name for name in os.listdir(out) if name.startswith(".")]
+    content = json.loads((out / "summary.json").read_text())
+    assert content["status"] == "stuck"
+    assert content["command"] == "simulate"
+    assert [p["name"] for p in content["phases"]] == ["slide left", "flip right"]
+    assert [p["bound"] for p in content["phases"]] == pytest.approx([0.966, 0.838], abs=1e-3)
+
+
+def test_wire_that_cannot_be_followed(wholearm, zero, scene_file, tmp_path):
+    path = scene_file(lambda data: data["phase"][0].update(toward="phi+"))  # the object slides without turning
+    code, printed, err = wholearm("simulate", path, "--torque", zero, "--out", tmp_path / "out")
+    assert code == 1
+    assert err == ""
+    assert printed.startswith("slide left: singular")
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["margin"] is None
