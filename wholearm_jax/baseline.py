@@ -95,7 +95,8 @@ def _raise(table, share: float, longest: float) -> tuple[np.ndarray, float, Stat
         torque = np.where(np.arange(2) == pushing, STEP * torque, torque)
         # Where a contact opens, back by 10 %: that is the last one that worked.
         going = not opened and abs(torque[pushing]) <= limit[pushing]
-    return *kept, count
+    torque, end, status, margin = kept
+    return torque, end, status, margin, count
 
 
 _hold, _coefficients = eqx.filter_jit(hold), eqx.filter_jit(coefficients)

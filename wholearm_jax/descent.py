@@ -162,7 +162,7 @@ def preconditioned() -> optax.GradientTransformationExtraArgs:
         right = jnp.concatenate([updates, linear.arrival])
         return -jnp.linalg.solve(jnp.concatenate([top, bottom]), right)[:n], state
 
-    return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)
+    return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)  # pyright: ignore[reportArgumentType]
 
 
 def projected(optimiser: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
@@ -172,10 +172,10 @@ def projected(optimiser: optax.GradientTransformation) -> optax.GradientTransfor
     def update(updates, state, params=None, *, linear: Linear, **extra):
         rows = linear.arrival_rows
         updates, state = optimiser.update(updates, state, params, **extra)
-        back = rows.T @ jnp.linalg.solve(rows @ rows.T, rows @ updates + linear.arrival)
+        back = rows.T @ jnp.linalg.solve(rows @ rows.T, rows @ jnp.asarray(updates) + linear.arrival)
         return updates - back, state
 
-    return optax.GradientTransformationExtraArgs(optimiser.init, update)
+    return optax.GradientTransformationExtraArgs(optimiser.init, update)  # pyright: ignore[reportArgumentType]
 
 
 class Advance(NamedTuple):

@@ -14,6 +14,7 @@ At rest, with friction, the object starts forward when the acceleration with for
 the one with backward signs is negative, and stays when neither is; both at once is ambiguous (Painleve).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax as dfx
@@ -79,24 +80,17 @@ class _FirstStep(dfx.AbstractAdaptiveStepSizeController):
     """
 
     controller: dfx.PIDController
-
-    @property
-    def rtol(self):
-        return self.controller.rtol
-
-    @property
-    def atol(self):
-        return self.controller.atol
-
-    @property
-    def norm(self):
-        return self.controller.norm
+    rtol: float
+    atol: float
+    norm: Callable
 
     def wrap(self, direction):
-        return _FirstStep(self.controller.wrap(direction))
+        inner = self.controller.wrap(direction)
+        return _FirstStep(controller=inner, rtol=self.rtol, atol=self.atol, norm=self.norm)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        return self.controller.init(terms, t0, t1, y0, jnp.asarray(1 / 32, t0.dtype), args, func, error_order)
+        first = jnp.full_like(t0, 1 / 32)
+        return self.controller.init(terms, t0, t1, y0, first, args, func, error_order)
 
     def adapt_step_size(self, *at):
         return self.controller.adapt_step_size(*at)
@@ -201,7 +195,8 @@ def single_step(table, seen, duration, how: Integration, piece, row, share, y, l
     solver = eqx.tree_at(lambda x: x.scan_kind, how.solver, "bounded", is_leaf=lambda x: x is None)
 
     def field(u, y, args):
-        return jnp.stack([y[1], acceleration(*args, piece, row, u, y[0], y[1])])
+        table, seen, duration = args
+        return jnp.stack([y[1], acceleration(table, seen, duration, piece, row, u, y[0], y[1])])
 
     term, args = dfx.ODETerm(field), (table, seen, duration)
     state = solver.init(term, share, share + length, y, args)
@@ -299,7 +294,8 @@ def _integrate(table, seen, duration, how, state, final, goal, floor):
     knots = seen.share
 
     def adaptive(knots):
-        errors = _FirstStep(dfx.PIDController(rtol=how.tolerance, atol=how.tolerance))
+        errors = dfx.PIDController(rtol=how.tolerance, atol=how.tolerance)
+        errors = _FirstStep(controller=errors, rtol=how.tolerance, atol=how.tolerance, norm=errors.norm)
         return dfx.ClipStepSizeController(errors, step_ts=knots, jump_ts=knots if how.steps else None)
 
     if how.adjoint in ("none", "forward"):
@@ -375,7 +371,8 @@ def _land(table, seen, duration, how, piece, node, end, goal, passed, wanted):
         return jnp.stack([y[1], acceleration(table, seen, duration, piece, row, share, y[0], y[1])])
 
     def step(share, length, y, args):
-        return single_step(*args, how, piece, row, share, y, length)
+        table, seen, duration = args
+        return single_step(table, seen, duration, how, piece, row, share, y, length)
 
     args = (table, seen, duration)
     fixed = stop_gradient((share, jnp.stack([s, w]), args, target, longest))
