@@ -210,7 +210,7 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     share = jnp.where(rest, share, state.share)
     verdict = jnp.where(rest, verdict, int(Status.OK))
     waited = rest & (share > state.share)
-    state = _append(state, waited, share, state.s, state.w, state.w, held=True)
+    state = _append(state, waited, share, state.s, state.w, state.w, held=True)._replace(share=share)
     blocked = verdict != int(Status.OK)
 
     last = state.piece >= table.count - 1
@@ -245,14 +245,17 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     last_y = jnp.where(overshot, saved[jnp.maximum(taken - 1, 0)], y0 * 0 + 1.0)
     passed = overshot & (last_y[0] > goal)
     landed = _land(table, seen, duration, how, state.piece, (share, s, w), last_time, goal, passed, overshot)
-    land_share, land_s, land_w = landed
+    land_share, land_s, land_w, astray = landed
     state = _append(state, overshot, land_share, land_s, land_w, w, held=False)
     onward = passed & ~last
     factor = table.factor[jnp.minimum(state.piece + 1, table.factor.shape[0] - 1)]
     # `done` waits for the next stage where the object has come to rest: it may start again.
     status = jnp.select(
-        [blocked, ~complete, passed & last, overshot],
-        [verdict, int(Status.MAX_STEPS), int(Status.LEFT_FORMATION), int(Status.MAX_STEPS)],
+        [blocked, ~complete, astray, passed & last, overshot],
+        [
+            verdict,
+            *(int(s) for s in (Status.MAX_STEPS, Status.NO_CONVERGENCE, Status.LEFT_FORMATION, Status.MAX_STEPS)),
+        ],
         int(Status.OK),
     )
     return state._replace(
@@ -261,7 +264,7 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
         w=jnp.where(overshot, land_w, w) * jnp.where(onward, factor, 1.0),
         piece=state.piece + onward,
         status=status,
-        done=blocked | ~complete | (passed & last) | ~overshot,
+        done=blocked | ~complete | astray | (passed & last) | ~overshot,
     )
 
 
@@ -359,7 +362,10 @@ def _departure(table, seen, state):
 
 
 def _land(table, seen, duration, how, piece, node, end, goal, passed, wanted):
-    """Retake the last step from `node` with the length that lands on `s = goal` (`passed`) or on `w = 0`."""
+    """Retake the last step from `node` with the length that lands on `s = goal` (`passed`) or on `w = 0`.
+
+    Returns where it lands, and whether it went astray: no length within the step lands there.
+    """
     share, s, w = node
     longest = jnp.where(wanted, end - share, 0.0)
     row = interval(seen, stop_gradient(share + longest / 2))
@@ -393,9 +399,12 @@ def _land(table, seen, duration, how, piece, node, end, goal, passed, wanted):
     rate = stop_gradient(field(share + length, y, args))
     pace = jnp.where(wanted & (rate[which] != 0), rate[which], 1.0)
     late = jnp.where(wanted, (target - y[which]) / pace, 0.0)
+    astray = wanted & ~(jnp.abs(late) <= longest)
+    late = jnp.where(astray, 0.0, late)
     y = y + rate * late
     return (
         share + length + late,
         jnp.where(passed, target, y[0]),
         jnp.where(passed, y[1], 0.0),
+        astray,
     )

@@ -1,0 +1,156 @@
+"""The wire's motion against an independent simulation of all five coordinates (`unreduced.py`, NumPy and SciPy)."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import unreduced
+
+import wholearm_jax
+from wholearm_jax import plan, scene_file, squeeze
+from wholearm_jax.motion import Integration
+
+DURATION = 1.0
+
+
+def passing(table, knots=9):
+    """Torques that carry the object along a wire and past its end: the best squeeze for a steady acceleration."""
+    u = 1.1 * jnp.linspace(0.0, 1.0, knots)  # aimed to arrive early
+    length, rate = table.length, 1.1 / DURATION
+    places = table.breaks[0] + length * jnp.minimum(u, 1.0) ** 2
+    held = squeeze.holds(table, places, 2 * length * u * rate, jnp.full(knots, 2 * length * rate**2))
+    return wholearm_jax.torque(np.linspace(0.0, DURATION, knots), held.torque)
+
+
+def other_hand():
+    """Offset links, unlike fingers, an inertia of its own, tilted gravity, another friction for each link."""
+    data = scene_file.to_dict(wholearm_jax.load("heptagon"))
+    data["hand"]["finger1"] |= {"offset": 0.006, "length": 0.18, "inertia": 3e-3, "viscous": 0.03, "dry": 0.02}
+    data["hand"]["finger2"] |= {"offset": 0.004, "inertia": 1.5e-3, "viscous": 0.01, "dry": 0.005}
+    data["object"] |= {"friction": {"palm": 0.2, "finger1": 0.05, "finger2": 0.12}, "inertia": 1.5e-4}
+    data["gravity"] = [0.8, -9.0]
+    return wholearm_jax.parse(data)
+
+
+SCENES = {
+    "heptagon": lambda: wholearm_jax.load("heptagon"),
+    "hexagon": lambda: wholearm_jax.load("hexagon"),
+    "other hand": other_hand,
+}
+# Reversals on the way: the slip of contact 1 (`finger1:v1`) late in the heptagon's flip.
+REVERSALS = {("heptagon", 1): [1], ("other hand", 1): [1]}
+
+
+def compared(name, phase, tolerance, samples):
+    """Errors of `z`, `z_dot`, `c_n` (each against its own size) over times from start to the wire's end.
+
+    The times are the integrator's own steps and `samples` even ones, also between a reversal and the end.
+    """
+    scene = SCENES[name]()
+    table = wholearm_jax.trace(scene)[phase].table
+    torque, start, length = passing(table), jnp.asarray(0.0), jnp.asarray(DURATION)
+    motion = plan.run(table, torque, start, length, Integration(tolerance=tolerance), False).motion
+    steps = np.asarray(motion.share)[: int(motion.count) + 1]
+    assert int(motion.status) == wholearm_jax.Status.LEFT_FORMATION
+    assert 0.5 < steps[-1] < 1.0
+
+    data = scene_file.to_dict(scene)
+    model = unreduced.Model(data, data["phase"][phase]["contacts"])
+    begin = np.asarray(plan.sample(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
+    assert np.abs(model.geometry(begin, np.zeros(5))[0]).max() < 1e-14
+    times, values = np.asarray(torque.times), np.asarray(torque.values)
+    run = model.simulate(begin, data["phase"][phase]["toward"], times, values, steps[-1] * DURATION)
+    assert [which for _, which in run.reversals] == REVERSALS.get((name, phase), [])
+
+    shares = [steps] + ([np.linspace(0.0, steps[-1], samples)] if samples else [])
+    for time, _ in run.reversals:
+        late = time / DURATION + (steps[-1] - time / DURATION) * np.linspace(0.05, 0.95, 10)
+        shares.append(late if samples else steps[:0])
+        assert time / DURATION < steps[-2]  # a step after the reversal is compared in any case
+    shares = np.concatenate(shares)
+    # The end may lie a rounding beyond the other simulation, and at a reversal forces jump.
+    shares = np.minimum(shares, steps[-1] * (1 - 1e-12))
+    for time, _ in run.reversals:
+        shares = shares[np.abs(shares - time / DURATION) > 1e-9]
+    ours = plan.sample(table, torque, start, length, motion, jnp.asarray(shares))
+    z, z_dot, cn = (np.array(column) for column in zip(*(run.at(t) for t in shares * DURATION), strict=True))
+    assert cn.min() > 0.3  # both see compression throughout, so that relative errors mean something
+    errors = np.abs(ours.z - z).max(), np.abs(ours.z_dot - z_dot).max(), np.abs(np.asarray(ours.cn) / cn - 1).max()
+    print(f"{name}, phase {phase}: largest errors z %.1e, z_dot %.1e, c_n (relative) %.1e" % errors)
+    return errors
+
+
+@pytest.mark.parametrize("phase", [0, 1])
+@pytest.mark.parametrize("name", SCENES)
+def test_steps(name, phase):
+    """At the default tolerance the integrator's steps agree."""
+    z, z_dot, cn = compared(name, phase, 1e-10, 0)
+    assert z < 1e-10
+    assert z_dot < 1e-9
+    assert cn < 1e-9
+
+
+@pytest.mark.parametrize("phase", [0, 1])
+@pytest.mark.parametrize("name", SCENES)
+def test_between_steps(name, phase):
+    """Short steps: the quintic between them agrees too, at any time."""
+    z, z_dot, cn = compared(name, phase, 1e-13, 150)
+    assert z < 1e-9
+    assert z_dot < 1e-7
+    assert cn < 1e-7
+
+
+@pytest.mark.parametrize("contacts", [("palm:v5", "finger1:v1", "finger2:e3", "finger1:e0")])
+def test_own_derivatives(contacts):
+    """The other simulation's gap rows and second derivatives, fingertips on edges included, against differences."""
+    data = scene_file.to_dict(other_hand())
+    model = unreduced.Model(data, contacts)
+    z, z_dot = np.array([0.01, 0.04, -0.3, 1.9, 0.9]), np.array([0.3, -0.2, 1.1, -0.7, 0.9])
+    h = 1e-5
+
+    def gaps(at):
+        return model.geometry(at, z_dot)[0]
+
+    rows = np.stack([(gaps(z + h * e) - gaps(z - h * e)) / (2 * h) for e in np.eye(5)], axis=1)
+    _, gap_rows, _, left = model.geometry(z, z_dot)
+    np.testing.assert_allclose(gap_rows, rows, atol=1e-9)
+    rates = (model.geometry(z + h * z_dot, z_dot)[1] - model.geometry(z - h * z_dot, z_dot)[1]) @ z_dot / (2 * h)
+    np.testing.assert_allclose(left, rates, atol=1e-9)
+
+
+@pytest.mark.parametrize("phase", [0, 1])
+@pytest.mark.parametrize("name", ["heptagon", "hexagon"])
+def test_start_after_waiting(name, phase):
+    """Friction holds the object until the torque has risen enough: it starts at that time, from there."""
+    scene = wholearm_jax.load(name)
+    table = wholearm_jax.trace(scene)[phase].table
+    later, delay = passing(table), 0.3
+    held = squeeze.hold(table, table.breaks[0], 0.0, -0.5 * table.length)  # slightly too weak to move
+    times = np.concatenate([[0.0], delay + np.asarray(later.times)])
+    values = np.concatenate([[held.torque], np.asarray(later.values)])
+    torque, start, length = wholearm_jax.torque(times, values), jnp.asarray(0.0), jnp.asarray(times[-1])
+    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-12), False).motion
+    assert bool(motion.held[0])
+    steps = np.asarray(motion.share)[: int(motion.count) + 1]
+    assert np.all(np.diff(steps) >= 0)
+    departure, end = steps[1] * times[-1], steps[-1] * times[-1]
+    assert 0.01 < departure < delay
+
+    data = scene_file.to_dict(scene)
+    model = unreduced.Model(data, data["phase"][phase]["contacts"])
+    begin = np.asarray(plan.sample(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
+    signs = np.sign(model.reversing(begin, model.direction(begin, data["phase"][phase]["toward"])))
+    first = np.array([np.interp(departure, times, column) for column in values.T])
+    # At departure the forward acceleration is zero by the other model too.
+    assert np.abs(model.solve(begin, np.zeros(5), first, signs)[0]).max() < 1e-9
+    # Moving off from exactly zero acceleration is all rounding: leave that to the first step after it.
+    from_there = np.concatenate([[departure + 1e-9], times[times > departure]])
+    rows = np.stack([np.interp(from_there, times, column) for column in values.T], axis=1)
+    run = model.simulate(begin, data["phase"][phase]["toward"], from_there, rows, end)
+    # From above the departure on; the reversal near the heptagon's end has its own test.
+    clock = np.linspace(departure + 0.01, departure + 0.95 * (end - departure), 40)
+    z = np.array([run.at(t)[0] for t in clock])
+    assert np.ptp(z[:, 0]) > 0.02
+    ours = plan.sample(table, torque, start, length, motion, jnp.asarray(clock / times[-1]))
+    error = np.abs(ours.z - z).max()
+    print(f"{name}, phase {phase}: departs at {departure:.3f} s, largest error {error:.1e}")
+    assert error < 1e-9
