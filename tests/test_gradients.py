@@ -84,4 +84,4 @@ def test_modes_and_differences_agree_along_random_directions(case):
         def moved(h, way=way):
             return float(value(jax.tree.map(lambda start, step: start + h * step, floats, way)))
 
-        assert forward == pytest.approx(nearest_difference(moved, forward), rel=1e-7, abs=1e-8)
+        assert forward == pytest.approx(nearest_difference(moved, forward), rel=1e-7, abs=1e-9)

@@ -42,7 +42,7 @@ def main() -> None:
 
 def _keep_compiled() -> None:
     """Keep compiled programs in the user's cache folder, unless JAX has been told otherwise."""
-    if jax.config.read("jax_compilation_cache_dir") is not None or "JAX_ENABLE_COMPILATION_CACHE" in os.environ:
+    if jax.config.values["jax_compilation_cache_dir"] is not None or "JAX_ENABLE_COMPILATION_CACHE" in os.environ:
         return
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     jax.config.update("jax_compilation_cache_dir", os.path.join(home, "wholearm_jax"))

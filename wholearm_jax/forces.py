@@ -134,7 +134,9 @@ def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion
         begin = jnp.stack([arc.quintic[0], motion.entry_w[step]])
         s, w = single_step(table, seen, duration, how, arc.piece, arc.row, arc.share[0], begin, length)
         share = arc.share[0] + length
-        here = force(table, seen, duration, arc.piece, arc.row, share, s, w)[contact]
+        here, slope = _force_and_slope(table, seen, duration, arc, contact, share, s, w)
+        inner = (xi > 0) & (xi < 1)
+        here = here + slope * stop_gradient(jnp.where(inner, _to_minimum(fixed, contact, xi, slope), 0.0))
         return jnp.where(arc.live & ~arc.held, here, jnp.inf), share, s, contact
 
     margin, share, s, contact = jax.vmap(refine)(lowest)
@@ -164,6 +166,27 @@ def smooth_margin(values, weights, temperature: Float[Array, ""]) -> tuple[Float
 
     m = stop_gradient(jax.lax.fori_loop(0, 40, step, low - temperature * heaviest))
     return m + temperature * (weights * jnp.log(jnp.where(live, values - m, 1.0) / temperature)).sum(), m
+
+
+def _force_and_slope(table, seen, duration, arc, contact, share, s, w):
+    """A contact force at a state, and its rate per share of the phase along the motion."""
+
+    def at(share, s, w):
+        return force(table, seen, duration, arc.piece, arc.row, share, s, w)[contact]
+
+    bend = acceleration(table, seen, duration, arc.piece, arc.row, share, s, w)
+    return jax.jvp(at, (share, s, w), (jnp.ones_like(share), w, bend))
+
+
+def _to_minimum(fixed, contact, xi, slope):
+    """How far, in shares, the true minimum lies from the quintic's: Newton's step with the force's own slope.
+
+    Added to the force to first order it leaves the value as it is, and makes the derivative that at the true minimum.
+    """
+    arc = fixed[3]
+    width = jnp.where(arc.share[1] > arc.share[0], arc.share[1] - arc.share[0], 1.0)
+    curve = jax.grad(jax.grad(lambda xi: forces_on(*fixed, xi)[contact]))(xi) / width**2
+    return -slope / jnp.where(curve > 0, curve, jnp.inf)
 
 
 def _minimise(function, seat, reach):

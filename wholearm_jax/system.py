@@ -57,7 +57,8 @@ def configuration_unit(length: Float[Array, ""]) -> Float[Array, "5"]:
 
 def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Formation) -> System:
     """Scale a formation by the object's size and mass."""
-    length, mass = jnp.sqrt((body.vertices**2).sum(1).max()), body.mass
+    real = jnp.arange(body.vertices.shape[0]) < body.count
+    length, mass = jnp.sqrt(jnp.where(real, (body.vertices**2).sum(1), 0.0).max()), body.mass
     rotary = mass * length**2
     small_body = Body(body.vertices / length, body.count, body.mass / mass, body.inertia / rotary, body.friction)
     small_hand = Hand(
