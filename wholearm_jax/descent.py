@@ -190,11 +190,12 @@ class Advance(NamedTuple):
 
 @eqx.filter_jit
 def advance(
-    p, state, linear: Linear, table: Table, limits: Limits, temperature, how: Integration, optimiser
+    p, state, linear: Linear, table: Table, limits: Limits, temperature, how: Integration, optimiser, first
 ) -> Advance:
     """One step of an optax optimiser, shortened until it lowers the loss after its return to the arrival.
 
-    The return is Newton's method on the arrival error with the rows of `linear`, by least changes in its metric.
+    `first` is the share of the direction to try first. The return is Newton's method on the arrival error with the rows
+    of `linear`, by least changes in its metric.
     """
     way, state = optimiser.update(linear.gradient, state, p, linear=linear)
     rows = linear.arrival_rows
@@ -202,7 +203,7 @@ def advance(
     back = spread @ jnp.linalg.inv(rows @ spread)
     promised = -linear.gradient @ way
     largest = jnp.abs(way[:-1]).max()
-    whole = jnp.minimum(1.0, 1.0 / jnp.maximum(largest, 1e-30))
+    whole = jnp.minimum(first, 1.0 / jnp.maximum(largest, 1e-30))
 
     # Where the start is off its arrival or outside the limits, its loss is no measure for the first step.
     held = jnp.isfinite(linear.loss)

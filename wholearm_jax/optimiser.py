@@ -7,6 +7,7 @@ whose honest simulation succeeds.
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -15,13 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.descent import Limits, advance, linearise, pack, preconditioned, projected, unpack
+from wholearm_jax.descent import SHORTER, Limits, advance, linearise, pack, preconditioned, projected, unpack
 from wholearm_jax.motion import Integration
 from wholearm_jax.plan import Result, Traced, describe, outcomes, require_x64, run, trace
+from wholearm_jax.reduction import blank
 from wholearm_jax.scene import Scene
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.squeeze import Bound, bound, holds
 from wholearm_jax.status import Status
+from wholearm_jax.wire import Resolution
 
 HOTTEST, COLDEST, COOLING = 0.1, 2e-4, 0.5  # temperatures as shares of the bound, and the factor from one to the next
 FIRST = 0.9  # share of the torque limits that the start may use
@@ -104,15 +107,19 @@ def optimise(
     `callback` sees every step. Where no torque can hold a formation, nothing is searched and the status says so.
     """
     require_x64()
-    traced = trace(scene)
-    tops = bounds(scene, traced=traced)
+    method = _DESCENT if optimiser is None else projected(optimiser)
+    with ThreadPoolExecutor(1) as beside:
+        ready = beside.submit(_compile, knots, method)
+        traced = trace(scene)
+        tops = bounds(scene, traced=traced)
+        ready.result()
     found, history, stopped = [], [], []
     for index, (at, top) in enumerate(zip(traced, tops, strict=True)):
         phase = scene.phases[index]
         pinned = found[-1].values[-1] if rate_limit is not None and found else None
         task = _Task(index, at, float(top.value), float(top.share), phase.duration, knots, steps, tolerance, pinned)
         limits = _limits(task, rate_limit, durations)
-        schedule, why, taken = _optimise_phase(task, limits, optimiser, callback)
+        schedule, why, taken = _optimise_phase(task, limits, method, callback)
         found.append(schedule)
         stopped.append(why)
         history += taken
@@ -137,9 +144,9 @@ class _Task:
     pinned: jax.Array | None
 
 
-def _optimise_phase(task: _Task, limits: Limits, optimiser, callback) -> tuple[Torque, str, list[Step]]:
+def _optimise_phase(task: _Task, limits: Limits, method, callback) -> tuple[Torque, str, list[Step]]:
     """Descend on one phase; return the best schedule (from time 0), why it stopped, and the steps taken."""
-    table, how = task.traced.table, Integration(max_steps=128, adjoint="forward")
+    table, how = task.traced.table, _HOW
     if int(table.status) != Status.OK:
         return (
             _evenly(task, np.zeros((task.knots, 2))),
@@ -152,15 +159,16 @@ def _optimise_phase(task: _Task, limits: Limits, optimiser, callback) -> tuple[T
         return _evenly(task, values), why, []
     if task.pinned is not None:
         values[0] = np.asarray(task.pinned)
-    p = _pack(_within_rate(values, limits, task), jnp.asarray(task.duration), table)
-    method = _DESCENT if optimiser is None else projected(optimiser)
+    p = _pack(_within_rate(values, limits, task), jnp.asarray(np.asarray(task.duration)), table)
     state, temperature = method.init(p), HOTTEST * task.bound
-    best, best_margin, history, since = p, -np.inf, [], 0
+    best, best_margin, history, since, share = p, -np.inf, [], 0, 1.0
     why = f"the limit of {task.steps} steps"
     for count in range(task.steps):
         begun = time.perf_counter()
-        linear = linearise(p, table, limits, jnp.asarray(temperature), how)
-        p, state, promised, taken = advance(p, state, linear, table, limits, jnp.asarray(temperature), how, method)
+        heat, first = jnp.asarray(temperature * _ONE), jnp.asarray(min(1.0, share / SHORTER) * _ONE)
+        linear = linearise(p, table, limits, heat, how)
+        p, state, promised, taken = advance(p, state, linear, table, limits, heat, how, method, first)
+        share = float(taken) or 1.0
         margin, status = _honest(p, table)
         step = Step(task.index, count, temperature, float(linear.loss), margin, status, time.perf_counter() - begun)
         history.append(step)
@@ -180,6 +188,24 @@ def _optimise_phase(task: _Task, limits: Limits, optimiser, callback) -> tuple[T
         if promised < temperature or taken == 0:
             temperature = max(temperature * COOLING, COLDEST * task.bound)
     return _unpack(best, table)[0], why, history
+
+
+def _compile(knots: int, method) -> None:
+    """Compile the descent's programs, on a blank table, while the wires are being traced."""
+    if (knots, method) in _COMPILED:
+        return
+    _COMPILED.add((knots, method))
+    table = blank(Resolution())
+    limits = Limits(*(jnp.asarray(a) for a in (np.full(2, np.inf), 1.0 * _ONE, 1.0 * _ONE, np.zeros(knots, bool))))
+    p, one = _pack(np.zeros((knots, 2)), jnp.asarray(_ONE), table), jnp.asarray(_ONE)
+    linear = linearise(p, table, limits, one, _HOW)
+    advance(p, method.init(p), linear, table, limits, one, _HOW, method, one)
+    _honest(p, table)
+
+
+_COMPILED: set = set()
+_ONE = np.ones(())
+_HOW = Integration(max_steps=128, adjoint="forward")
 
 
 def _evenly(task: _Task, values) -> Torque:
@@ -239,9 +265,10 @@ _bound = jax.jit(bound)
 
 def _limits(task: _Task, rate_limit, durations) -> Limits:
     shortest, longest = durations or (float(task.duration), float(task.duration))
-    rate = jnp.full(2, jnp.inf if rate_limit is None else float(rate_limit))
-    pinned = jnp.zeros(task.knots, bool).at[0].set(task.pinned is not None)
-    return Limits(rate, jnp.asarray(float(shortest)), jnp.asarray(float(longest)), pinned)
+    rate = np.full(2, np.inf if rate_limit is None else float(rate_limit))
+    pinned = np.zeros(task.knots, bool)
+    pinned[0] = task.pinned is not None
+    return Limits(*(jnp.asarray(a) for a in (rate, shortest * _ONE, longest * _ONE, pinned)))
 
 
 def _within_rate(values, limits: Limits, task: _Task):

@@ -96,7 +96,8 @@ def prepare(scene_body, hand, gravity, formation, rough, heading, resolution: Re
     """Trace a formation's wire from a rough start (SI) and tabulate its reduced dynamics."""
     mechanics = system(scene_body, hand, gravity, formation)
     wire = trace_wire(mechanics, rough, heading, resolution)
-    return Traced(wire, reduce_wire(mechanics, wire))
+    # Weak types, which depend on how a constant was written, would make a second program of the next one.
+    return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), Traced(wire, reduce_wire(mechanics, wire)))
 
 
 @eqx.filter_jit

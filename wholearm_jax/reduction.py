@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from wholearm_jax.contacts import normal_curvature, normal_rows, slip_rows
 from wholearm_jax.status import Status
 from wholearm_jax.system import System, configuration_unit
-from wholearm_jax.wire import Wire, chebyshev
+from wholearm_jax.wire import Resolution, Wire, chebyshev
 
 TERMS = 5  # 1, v^2, v, tau1, tau2
 
@@ -90,7 +90,7 @@ def reduce_wire(system: System, wire: Wire) -> Table:
         matrix, right = balance(system, z, x, bend, slip_sign, joint_sign)
         smooth, _ = balance(system, z, x, bend, 0 * slip_sign, joint_sign)
         back, resting = balance(system, z, x, bend, -slip_sign, -joint_sign)
-        inverse = jnp.linalg.inv(matrix)
+        inverse = jnp.linalg.solve(matrix, jnp.eye(5, dtype=z.dtype))
         solution = inverse @ right
         behind = jnp.linalg.solve(back, resting[:, jnp.array([0, 3, 4])])
         # Friction may turn the determinant's sign only by passing through a singular matrix.
@@ -131,6 +131,19 @@ def reduce_wire(system: System, wire: Wire) -> Table:
         condition_s=_place(wire, panel, at),
         status=jnp.where(wire.status > 0, wire.status, jnp.where(broken, int(Status.SINGULAR), 0)),
     )
+
+
+def blank(resolution: Resolution, contacts: int = 4) -> Table:
+    """A table of the right shapes that holds no wire: something to compile with."""
+    pieces, panels, nodes = resolution
+    zero, whole = jnp.asarray(np.zeros(())), jnp.asarray(np.zeros((), int))
+    each = {name: np.zeros((panels, nodes, n)) for name, n in (("acceleration", 5), ("backward", 3))}
+    each |= {name: np.zeros((panels, nodes, 5)) for name in ("configuration", "velocity")}
+    each |= {"force": np.zeros((panels, nodes, contacts, TERMS)), "tension": np.zeros((pieces, contacts))}
+    each |= {"breaks": np.arange(pieces + 1.0), "factor": np.ones(pieces), "torque_limit": np.ones(2)}
+    each |= {"first": np.zeros(pieces, int), "panels": np.ones(pieces, int)}
+    filled = {name: jnp.asarray(value) for name, value in each.items()}
+    return Table(count=whole + 1, error=zero, condition=zero, condition_s=zero, status=whole, **filled)
 
 
 def powers(table: Table, piece: Int[Array, ""], s: Float[Array, ""]) -> tuple[Int[Array, ""], Float[Array, ""]]:

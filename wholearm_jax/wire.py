@@ -170,10 +170,8 @@ def _misplaced(system, z):
 
 
 def _null(rows):
-    """A unit vector orthogonal to four rows: signed minors, the five-dimensional cross product."""
-    minors = jnp.stack([jnp.linalg.det(jnp.delete(rows, k, axis=1)) for k in range(5)])
-    minors = minors * jnp.array([1.0, -1.0, 1.0, -1.0, 1.0], rows.dtype)
-    return minors / jnp.maximum(jnp.sqrt(minors @ minors), 1e-30)
+    """A unit vector orthogonal to four rows."""
+    return jnp.linalg.qr(rows.T, mode="complete")[0][:, 4]
 
 
 def _oriented(system, z, heading):
