@@ -183,9 +183,9 @@ def _to_minimum(fixed, contact, xi, slope):
 
     Added to the force to first order it leaves the value as it is, and makes the derivative that at the true minimum.
     """
-    arc = fixed[3]
+    table, seen, duration, arc = fixed
     width = jnp.where(arc.share[1] > arc.share[0], arc.share[1] - arc.share[0], 1.0)
-    curve = jax.grad(jax.grad(lambda xi: forces_on(*fixed, xi)[contact]))(xi) / width**2
+    curve = jax.grad(jax.grad(lambda xi: forces_on(table, seen, duration, arc, xi)[contact]))(xi) / width**2
     return -slope / jnp.where(curve > 0, curve, jnp.inf)
 
 

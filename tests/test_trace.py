@@ -1,0 +1,133 @@
+"""Wires: where they start, how they end, what their tables hold."""
+
+from itertools import pairwise
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.contacts import gaps, normal_rows, slip_rows
+from wholearm_jax.newton import newton
+from wholearm_jax.plan import end_configuration, ending
+from wholearm_jax.reduction import horner, powers
+from wholearm_jax.scene import body
+from wholearm_jax.scene_file import to_dict
+from wholearm_jax.system import system
+
+ENDS = {
+    "heptagon": ("finger2:v4 is made", "palm:v0 is made"),
+    "hexagon": ("finger2:v4 is made", "palm:v1 is made"),
+}
+
+
+@pytest.fixture(scope="module", params=ENDS)
+def traced(request):
+    scene = wa.load(request.param)
+    mechanics = [system(body(scene.object), scene.hand, scene.gravity, p.formation) for p in scene.phases]
+    return request.param, scene, wa.trace(scene), mechanics
+
+
+def test_newton_converges_quadratically():
+    """The error's logarithm at least doubles a step, on a root known in closed form."""
+
+    def function(z):
+        return jnp.stack([z[0] ** 2 - 2.0, z[0] * z[1] - 1.0])
+
+    exact = np.array([np.sqrt(2), np.sqrt(0.5)])
+    errors = [np.abs(np.asarray(newton(function, jnp.array([1.6, 0.6]), steps=k).z) - exact).max() for k in range(1, 4)]
+    for before, after in pairwise(errors):
+        assert after < 2 * before**2 + 1e-15
+
+
+def test_starts_and_ends_touch(traced):
+    name, scene, wires, mechanics = traced
+    for phase, at, formation, end in zip(scene.phases, wires, mechanics, ENDS[name], strict=True):
+        wire = at.wire
+        assert float(jnp.abs(gaps(formation.contacts, wire.start)).max()) <= 1e-13
+        assert float(jnp.abs(gaps(formation.contacts, wire.end)).max()) <= 1e-12
+        assert ending(at, phase, scene.object.vertices.shape[0]) == end
+        made = gaps(formation.candidates, wire.end)[wire.end_contact]
+        assert abs(float(made)) <= 1e-10
+
+
+def test_every_node_lies_on_the_wire(traced):
+    _, _, wires, mechanics = traced
+    for at, formation in zip(wires, mechanics, strict=True):
+        left = jax.vmap(jax.vmap(lambda z, f=formation: gaps(f.contacts, z)))(at.wire.nodes)
+        assert float(jnp.abs(left).max()) <= 1e-13
+
+
+def test_the_table_holds_the_wire_between_its_nodes(traced):
+    _, _, wires, mechanics = traced
+    for at, formation in zip(wires, mechanics, strict=True):
+        table = at.table
+        assert float(table.error) < 1e-9
+        for s in np.random.default_rng(1).uniform(0, float(table.length), 50):
+            piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
+            panel, xi = powers(table, piece, jnp.asarray(s))
+            z = horner(table.configuration[panel], xi) / formation.configuration_unit
+            x = horner(table.velocity[panel], xi) / formation.configuration_unit
+            assert float(jnp.abs(gaps(formation.contacts, z)).max()) < 1e-10
+            assert float(jnp.abs(normal_rows(formation.contacts, z) @ x).max()) < 1e-9
+
+
+def test_slips_vanish_where_pieces_meet(traced):
+    name, _, wires, mechanics = traced
+    for at, formation in zip(wires, mechanics, strict=True):
+        table, wire = at.table, at.wire
+        for k in range(1, int(table.count)):
+            panel, xi = powers(table, jnp.asarray(k), table.breaks[k])
+            z = horner(table.configuration[panel], xi) / formation.configuration_unit
+            x = horner(table.velocity[panel], xi) / formation.configuration_unit
+            flipped = np.flatnonzero(np.asarray(wire.slip_sign[k] != wire.slip_sign[k - 1]))
+            assert flipped.size > 0
+            slip = np.asarray(slip_rows(formation.contacts, z) @ x)
+            assert np.abs(slip[flipped]).max() < 1e-10
+    if name == "heptagon":
+        assert int(wires[1].table.count) == 2, "the heptagon's flip reverses a slip"
+
+
+def changed(name, **phase):
+    data = to_dict(wa.load(name))
+    data["phase"] = [data["phase"][0] | phase]
+    return wa.parse(data)
+
+
+def test_until_ends_a_phase_early():
+    at = wa.trace(changed("heptagon", until={"x": -0.01}))[0]
+    assert int(at.table.status) == wa.Status.OK
+    assert float(end_configuration(at)[0]) == pytest.approx(-0.01, abs=1e-12)
+
+
+def test_the_other_way_along_the_wire():
+    ahead, back = wa.trace(changed("heptagon"))[0], wa.trace(changed("heptagon", toward="x+"))[0]
+    assert float(end_configuration(back)[0]) > float(ahead.wire.start[0] * 0.0 + 0.02)
+
+
+def test_a_start_that_no_contact_can_reach_is_refused_by_status():
+    scene = wa.load("heptagon")
+    far = eqx.tree_at(lambda s: s.hand.joint, scene, jnp.array([[2.0, 0.0], [-2.0, 0.0]]))
+    assert int(wa.trace(far)[0].table.status) in (wa.Status.NO_CONVERGENCE, wa.Status.LEFT_FORMATION)
+
+
+def test_statuses_name_what_happened():
+    scene = changed("heptagon")
+    even = wa.quasistatic(scene)
+
+    def status(values, scene=scene):
+        result = wa.simulate(scene, wa.torque(even.times, values))
+        return result.phases[0].status, result.phases[0]
+
+    assert status(0 * even.values)[0] is not wa.Status.OK
+    assert status(-0.5 * jnp.abs(even.values))[0] in (wa.Status.REVERSED, wa.Status.CONTACT_LOST)
+    late, phase = status(0.97 * even.values)
+    assert late in (wa.Status.NOT_REACHED, wa.Status.STUCK)
+    assert phase.time == pytest.approx(1.0) or late is wa.Status.STUCK
+    early, phase = status(even.values * jnp.array([1.1, 1.0]))
+    assert early in (wa.Status.LEFT_FORMATION, wa.Status.CONTACT_LOST)
+    assert phase.time < 1.0
+    assert "slide left" in phase.message
+    assert early.label in phase.message
