@@ -131,3 +131,17 @@ def test_statuses_name_what_happened():
     assert phase.time < 1.0
     assert "slide left" in phase.message
     assert early.label in phase.message
+
+
+def test_a_wire_passes_the_turning_point_of_theta1():
+    data = to_dict(wa.load("heptagon"))
+    contacts = ["palm:v0", "finger1:v3", "finger2:v5", "finger2:v6"]
+    data["phase"] = [{"name": "turn", "contacts": contacts, "toward": "phi-", "duration": 1.0}]
+    data["start"] = {"x": -0.0219, "y": 0.038, "phi": -1.0551, "theta1": 1.6714, "theta2": 1.133}
+    at = wa.trace(wa.parse(data))[0]
+    table, wire = at.table, at.wire
+    assert int(table.status) == wa.Status.OK
+    np.testing.assert_array_equal(wire.joint_sign[:2, 0], [-1.0, 1.0])
+    panel, xi = powers(table, jnp.asarray(1), table.breaks[1])
+    assert abs(float(horner(table.velocity[panel], xi)[3])) < 1e-10
+    assert float(table.breaks[1]) < float(table.length) - 1e-3
