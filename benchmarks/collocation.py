@@ -1,0 +1,474 @@
+r"""Direct collocation of one phase with CasADi and IPOPT: what `wholearm_jax.optimise` is compared with.
+
+    python benchmarks/collocation.py [--duration SECONDS]
+
+The same problem on the same tabulated wire: from rest at the wire's start to rest at its end in a fixed duration `T`,
+torques linear between evenly spaced knots and within their limits, the least contact force as large as it can be. Time
+is a share `u` of `T`, place a share `p` of the wire's length `L`, and `w = dp/du`:
+
+    maximise m   subject to   dp/du = w,   dw/du = (T^2/L) (A0 + A3 tau1 + A4 tau2) + T A2 w + L A1 w^2,
+                              F0 + F1 (L w/T)^2 + F2 (L w/T) + F3 tau1 + F4 tau2 >= m,   |tau| <= limit,   w >= 0
+
+with `A` and `F` the coefficients of `wholearm_jax.reduction.Table`. States are cubics on each interval that satisfy the
+equation of motion at Radau's three points; forces count at these points and at the start. Each smooth piece of the
+wire enters as one Chebyshev series for every coefficient, refitted from the table to 1e-10, so that IPOPT sees smooth
+functions and exact second derivatives.
+
+Where a slip reverses, `A` and `F` jump at a known place but at an unknown time. The interval in which the motion
+passes it is divided there and its time is a variable: no smoothing, and no loss of order. Which interval that is
+follows from the first guess, and moves on while the optimum lies at the interval's end.
+"""
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import casadi as ca
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import beta, betainc
+
+import wholearm_jax as wa
+from wholearm_jax.motion import Integration
+from wholearm_jax.plan import run
+from wholearm_jax.reduction import Table
+from wholearm_jax.schedule import padded
+from wholearm_jax.squeeze import holds
+
+jax.config.update("jax_enable_x64", True)
+
+KNOTS, DEGREE = 31, 3
+FIT = 1e-10  # relative error of the series that stand for the table
+BELLS = tuple((p, q) for p in (1, 2, 4, 8) for q in (1, 2, 4, 8))  # motions with speed ~ u^p (1 - u)^q
+MINIMUM_JERK = (2, 2)
+MOVES, WIDELY = 6, 20  # intervals of reversals tried, and where none is to be missed
+SETTINGS = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "ipopt.max_iter": 1000, "ipopt.tol": 1e-8}
+CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+
+
+class Piece(NamedTuple):
+    """A smooth piece of a wire: from `low` to `high` in shares of its length, speeds scaled by `factor` on entry.
+
+    `series[k, j]` is Chebyshev coefficient `k` of function `j`: `A0 ... A4`, then `F0 ... F4` of each contact.
+    """
+
+    low: float
+    high: float
+    factor: float
+    series: np.ndarray
+
+
+class Wire(NamedTuple):
+    """What the transcription needs of a `wholearm_jax` table."""
+
+    pieces: tuple[Piece, ...]
+    length: float
+    limit: np.ndarray
+
+
+class Course(NamedTuple):
+    """A motion over one phase, sampled: shares `u`, `p`, `w`; torques at the knots in limits, and a least force [N]."""
+
+    u: np.ndarray
+    p: np.ndarray
+    w: np.ndarray
+    tau: np.ndarray
+    least: float
+
+
+@dataclass(frozen=True)
+class Collocated:
+    """What IPOPT made of a phase.
+
+    `course.least` [N] is the least force at the collocation points, `ipopt` its status; `margin` [N] and `verdict` are
+    those of the honest simulation of `torque` (knots x 2, N m), `missed` the distance to the wire's end that it leaves,
+    in wire lengths. It took `solves` solves, `iterations` in all, in `solve` seconds after `build` seconds of building.
+    Of the `guesses` tried one after the other only `spent` counts all, in seconds.
+    """
+
+    torque: np.ndarray
+    course: Course
+    ipopt: str
+    margin: float
+    verdict: str
+    missed: float
+    iterations: int
+    solves: int
+    build: float
+    solve: float
+    guesses: int = 1
+    spent: float = 0.0
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether IPOPT converged and the simulation arrives with every contact compressive."""
+        return self.ipopt in CONVERGED and self.verdict == "ok"
+
+
+def collocate(table: Table, duration: float, *, knots: int = KNOTS) -> Collocated:
+    """Maximise a phase's margin by collocation, one interval between knots, from up to three first guesses.
+
+    The minimum-jerk motion comes first, then the bell motion that can be squeezed hardest, then the even one; each
+    with the best squeeze at each instant. The first that succeeds is returned, else the best. The programme is written
+    out in scalars: IPOPT is then about four times faster, although building takes twenty times longer.
+    """
+    phase = Phase(read(table), duration, knots, 1)
+    tried: list[Collocated] = []
+    for bell in dict.fromkeys((MINIMUM_JERK, _hardest(table, duration), (1, 1))):
+        tried.append(_solved(table, phase, _course(table, phase, bell), expand=True, widely=False))
+        if tried[-1].succeeded:
+            break
+    best = max(tried, key=lambda one: (one.succeeded, one.ipopt in CONVERGED, one.margin))
+    return replace(best, guesses=len(tried), spent=sum(one.build + one.solve for one in tried))
+
+
+def refined(table: Table, duration: float, coarse: Collocated, *, refine: int = 4) -> Collocated:
+    """The same problem and knots with `refine` collocation intervals between knots, from a coarse solution.
+
+    Forces are then held at so many more times that the simulated margin is close to the programme's, and the intervals
+    of reversals are searched widely: the best that is known of a phase, at a cost that no comparison counts.
+    """
+    phase = Phase(read(table), duration, len(coarse.torque), refine)
+    return _solved(table, phase, coarse.course, expand=False, widely=True)
+
+
+# --- the wire as smooth functions -------------------------------------------------------------------------------------
+
+
+def read(table: Table) -> Wire:
+    """One Chebyshev series a piece, of the degree that reproduces the table's polynomials to `FIT`."""
+    count = int(table.count)
+    breaks = np.asarray(table.breaks)[: count + 1]
+    shares = (breaks - breaks[0]) / (breaks[-1] - breaks[0])
+    pieces = [Piece(shares[k], shares[k + 1], float(table.factor[k]), _series(table, k)) for k in range(count)]
+    return Wire(tuple(pieces), float(table.length), np.asarray(table.torque_limit))
+
+
+def _series(table: Table, piece: int) -> np.ndarray:
+    first, panels = int(table.first[piece]), int(table.panels[piece])
+    rows = slice(first, first + panels)
+    force = np.asarray(table.force[rows])
+    tables = np.concatenate([np.asarray(table.acceleration[rows]), force.reshape(*force.shape[:2], -1)], axis=2)
+    for degree in range(6, 120, 3):
+        series = np.polynomial.chebyshev.chebinterpolate(lambda x: _evaluate(tables, x), degree)
+        check = np.linspace(-1, 1, 401)
+        exact = _evaluate(tables, check)
+        error = np.abs(np.polynomial.chebyshev.chebval(check, series).T - exact).max(0)
+        if np.all(error <= FIT * np.maximum(np.abs(exact).max(0), 1e-3 * np.abs(exact).max())):
+            break
+    return series
+
+
+def _evaluate(tables: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The piece's polynomials at `x` in [-1, 1] over the whole piece."""
+    share = (x + 1) / 2 * len(tables)
+    panel = np.clip(share.astype(int), 0, len(tables) - 1)
+    xi = 2 * (share - panel) - 1
+    value = tables[panel, -1]
+    for row in range(tables.shape[1] - 2, -1, -1):
+        value = tables[panel, row] + xi[:, None] * value
+    return value
+
+
+# --- the nonlinear programme ------------------------------------------------------------------------------------------
+
+
+class Phase(NamedTuple):
+    """What is to be solved: `duration` [s], `knots` torques a joint, `refine` collocation intervals between two."""
+
+    wire: Wire
+    duration: float
+    knots: int
+    refine: int
+
+    @property
+    def intervals(self) -> int:
+        return (self.knots - 1) * self.refine
+
+
+class Part(NamedTuple):
+    """A stretch of time with its own cubic: in interval `row`, on `piece`, from `begin` to `end` in intervals.
+
+    `begin` and `end` are numbers, or variables where a piece of the wire ends within the interval.
+    """
+
+    row: int
+    piece: int
+    begin: ca.MX | float
+    end: ca.MX | float
+
+
+class Programme(NamedTuple):
+    """IPOPT's solver for one phase, bounds of its variables and constraints, and how its variables are laid out.
+
+    Variables are torques, splits, states and the least force, in this order (`_pack`, `_unpack`); `times(splits)` are
+    the shares `u` of the states.
+    """
+
+    solver: ca.Function
+    bounds: dict[str, np.ndarray]
+    times: ca.Function
+    knots: int
+    splits: int
+
+
+def _programme(phase: Phase, rows: tuple[int, ...], expand: bool) -> Programme:
+    """The transcription of a phase whose motion leaves the wire's piece `k` in interval `rows[k]`."""
+    tau, splits, least = ca.MX.sym("tau", 2, phase.knots), ca.MX.sym("splits", len(rows)), ca.MX.sym("m")
+    parts = _parts(phase, rows, splits)
+    states = ca.MX.sym("states", 2, DEGREE * len(parts))
+    equal, positive, times, first, before = [], [], [], 0, ca.MX.zeros(2, 1)
+    for number in range(len(phase.wire.pieces)):
+        own = [part for part in parts if part.piece == number]
+        last = first + DEGREE * len(own)
+        block = _block(phase, own, before, states[:, first:last], tau)
+        equal.append(ca.vec(block.defects))
+        positive += [ca.vec(block.forces) - least, block.onward]
+        times.append(block.times)
+        first, before = last, states[:, last - 1]
+    problem = {
+        "x": ca.vertcat(ca.vec(tau), splits, ca.vec(states), least),
+        "f": -least,
+        "g": ca.vertcat(*equal, *positive),
+    }
+    counts = [sum(rows.numel() for rows in group) for group in (equal, positive)]
+    low, high = _limits(phase, parts, len(rows))
+    return Programme(
+        solver=ca.nlpsol("solver", "ipopt", problem, SETTINGS | {"expand": expand}),
+        bounds={"lbx": low, "ubx": high, "lbg": np.zeros(sum(counts)), "ubg": np.repeat([0.0, np.inf], counts)},
+        times=ca.Function("times", [splits], [ca.horzcat(*times)]),
+        knots=phase.knots,
+        splits=len(rows),
+    )
+
+
+def _parts(phase: Phase, rows: tuple[int, ...], splits: ca.MX) -> list[Part]:
+    """The parts of a phase whose motion leaves piece `k` in interval `rows[k]`, at the share `splits[k]` of it."""
+    parts = []
+    for row in range(phase.intervals):
+        begin: ca.MX | float = 0.0
+        for piece in range(sum(r < row for r in rows), sum(r <= row for r in rows) + 1):
+            end = splits[piece] if piece < len(rows) and rows[piece] == row else 1.0
+            parts.append(Part(row, piece, begin, end))
+            begin = end
+    return parts
+
+
+class Block(NamedTuple):
+    """One piece's equations: collocation `defects`, `forces` [N], shares `times`, what is positive to go `onward`."""
+
+    defects: ca.MX
+    forces: ca.MX
+    times: ca.MX
+    onward: ca.MX
+
+
+def _block(phase: Phase, parts: list[Part], before: ca.MX, states: ca.MX, tau: ca.MX) -> Block:
+    """The equations of the parts on one piece, which is entered in the state `before` (as the last piece counts speed).
+
+    Forces count at every collocation point and where the piece is entered, since they jump there.
+    """
+    piece = phase.wire.pieces[parts[0].piece]
+    points = np.array(ca.collocation_points(DEGREE, "radau"))
+    slopes = ca.DM(ca.collocation_coeff(points.tolist())[0])
+    before = before * ca.DM([1.0, piece.factor])
+    torques, times, widths, rates = [_torque(phase, tau, parts[0].row, parts[0].begin)], [], [], []
+    for k, part in enumerate(parts):
+        own, width = states[:, DEGREE * k : DEGREE * (k + 1)], part.end - part.begin
+        start = states[:, DEGREE * k - 1] if k else before
+        rates.append(ca.mtimes(ca.horzcat(start, own), slopes))
+        for place in points:
+            share = part.begin + place * width
+            torques.append(_torque(phase, tau, part.row, share))
+            times.append((part.row + share) / phase.intervals)
+            widths.append(width / phase.intervals)
+    pull, forces = _motion(phase, piece).map(len(torques))(ca.horzcat(before, states), ca.horzcat(*torques))
+    field = ca.vertcat(states[1, :], pull[1:])
+    width = ca.horzcat(*widths)
+    # At rest the object must start forward; a divided interval must not have a negative part.
+    entry = pull[0] if parts[0].piece == 0 else ca.MX(1.0) * (parts[0].end - parts[0].begin)
+    return Block(ca.horzcat(*rates) - ca.repmat(width, 2, 1) * field, forces, ca.horzcat(*times), entry)
+
+
+def _motion(phase: Phase, piece: Piece) -> ca.Function:
+    """`dw/du` and the contact forces [N] as a function of the state `(p, w)` and the torques in limits."""
+    state, tau = ca.SX.sym("state", 2), ca.SX.sym("tau", 2)
+    motion, force = _coefficients(piece, state[0])
+    speed = state[1] * phase.wire.length / phase.duration
+    terms = ca.vertcat(1.0, speed**2, speed, tau * phase.wire.limit)
+    pull = phase.duration**2 / phase.wire.length * ca.dot(motion, terms)
+    return ca.Function("motion", [state, tau], [pull, ca.mtimes(force, terms)])
+
+
+def _coefficients(piece: Piece, share: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """`A` (5) and `F` (contacts x 5) at a share of the wire."""
+    x = (2 * share - piece.low - piece.high) / (piece.high - piece.low)
+    terms = [ca.SX(1), x]
+    while len(terms) < len(piece.series):
+        terms.append(2 * x * terms[-1] - terms[-2])
+    values = ca.mtimes(ca.DM(piece.series.T), ca.vertcat(*terms))
+    return values[:5], ca.reshape(values[5:], 5, -1).T
+
+
+def _torque(phase: Phase, tau: ca.MX, row: int, share) -> ca.MX:
+    """Torques at a share of interval `row`, `refine` of which lie between two knots."""
+    knot, within = divmod(row, phase.refine)
+    weight = (within + share) / phase.refine
+    return tau[:, knot] * (1 - weight) + tau[:, knot + 1] * weight
+
+
+def _limits(phase: Phase, parts: list[Part], splits: int) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the variables: torques, splits in [0, 1], states within their piece, its end where the next begins."""
+    pieces = phase.wire.pieces
+    states = np.zeros((2, DEGREE * len(parts), 2))  # lower and upper bounds of p and w
+    states[0, :, 0] = np.repeat([pieces[part.piece].low for part in parts], DEGREE)
+    states[1, :, 0] = np.repeat([pieces[part.piece].high for part in parts], DEGREE)
+    states[1, :, 1] = np.inf
+    for k, part in enumerate(parts):
+        if k + 1 == len(parts) or parts[k + 1].piece > part.piece:
+            states[0, DEGREE * (k + 1) - 1, 0] = pieces[part.piece].high
+    states[1, -1, 1] = 0.0
+    one = np.ones(2 * phase.knots)
+    return (
+        np.concatenate([-one, np.zeros(splits), states[0].ravel(), [-np.inf]]),
+        np.concatenate([one, np.ones(splits), states[1].ravel(), [np.inf]]),
+    )
+
+
+# --- first guesses and the search for the intervals of reversals ------------------------------------------------------
+
+
+def _bell(u: np.ndarray, p: int, q: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Place, speed and acceleration of the motion from 0 to 1 with speed ~ `u^p (1 - u)^q`."""
+    inner = np.clip(u, 1e-12, 1 - 1e-12)
+    speed = inner**p * (1 - inner) ** q / beta(p + 1, q + 1)
+    return betainc(p + 1, q + 1, u), speed, speed * (p / inner - q / (1 - inner))
+
+
+def _squeezed(table: Table, duration: float, bell: tuple[int, int], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The best squeeze on a bell motion at shares `times`: torques [N m] and the least forces [N]."""
+    place, speed, pull = _bell(times, *bell)
+    length = float(table.length)
+    s = float(table.breaks[0]) + length * place
+    held = _holds(table, s, speed * length / duration, pull * length / duration**2)
+    return np.asarray(held.torque), np.asarray(held.margin)
+
+
+_holds = jax.jit(holds)
+
+
+def _hardest(table: Table, duration: float) -> tuple[int, int]:
+    """The bell motion whose best squeeze has the largest least force."""
+    times = np.linspace(0, 1, 241)
+    return max(BELLS, key=lambda bell: _squeezed(table, duration, bell, times)[1].min())
+
+
+def _course(table: Table, phase: Phase, bell: tuple[int, int]) -> Course:
+    u = np.linspace(0, 1, 1501)
+    tau, margin = _squeezed(table, phase.duration, bell, np.linspace(0, 1, phase.knots))
+    place, speed, _ = _bell(u, *bell)
+    # A motion that no torque within limits can follow begins at the limits.
+    tau = np.clip(np.nan_to_num(tau / phase.wire.limit), -0.95, 0.95)
+    return Course(u, place, speed, tau, max(float(margin.min()), 0.0))
+
+
+def _passed(phase: Phase, course: Course) -> tuple[tuple[int, ...], np.ndarray]:
+    """The intervals in which a course passes the pieces' ends, and where in them."""
+    ends = [piece.high for piece in phase.wire.pieces[:-1]]
+    at = np.interp(ends, course.p, course.u) * phase.intervals
+    rows = np.clip(at.astype(int), 0, phase.intervals - 1)
+    return tuple(int(row) for row in rows), np.clip(at - rows, 0.02, 0.98)
+
+
+def _solved(table: Table, phase: Phase, course: Course, *, expand: bool, widely: bool) -> Collocated:
+    """Solve from a course, and again with other intervals for the reversals for as long as that gains."""
+    waiting, seen, iterations, build, solve = [_passed(phase, course)], set(), 0, 0.0, 0.0
+    best, reached, status = (False, -np.inf), course, ""
+    while waiting and len(seen) < (WIDELY if widely else MOVES):
+        rows, splits = waiting.pop(0)
+        seen.add(rows)
+        begun = time.perf_counter()
+        programme = _programme(phase, rows, expand)
+        built = time.perf_counter()
+        found = programme.solver(x0=_pack(programme, reached, splits), **programme.bounds)
+        solve, build = solve + time.perf_counter() - built, build + built - begun
+        stats = programme.solver.stats()
+        iterations += stats["iter_count"]
+        new, splits = _unpack(programme, np.asarray(found["x"]).ravel())
+        rank = (stats["return_status"] in CONVERGED, new.least)
+        if rank > best:
+            best, reached, status = rank, new, stats["return_status"]
+            waiting = [one for one in _neighbours(phase, rows, splits, widely) if one[0] not in seen]
+    torque = reached.tau * phase.wire.limit
+    margin, verdict, missed = _resimulated(table, phase, torque)
+    return Collocated(torque, reached, status, margin, verdict, missed, iterations, len(seen), build, solve)
+
+
+def _neighbours(phase: Phase, rows: tuple[int, ...], splits: np.ndarray, widely: bool):
+    """Rows and splits to try next: every reversal at its interval's end moved beyond it, or `widely` each by 1 or 2."""
+    if widely:
+        steps = [step * one for step in (1, -1, 2, -2) for one in np.eye(len(rows), dtype=int)]
+    else:
+        steps = [np.where(splits < 1e-3, -1, np.where(splits > 1 - 1e-3, 1, 0))]
+    found = []
+    for step in steps:
+        moved = np.array(rows, int) + step
+        if np.any(step) and moved.min() >= 0 and moved.max() < phase.intervals and np.all(np.diff(moved) >= 0):
+            found.append((tuple(moved.tolist()), np.where(step < 0, 0.98, np.where(step > 0, 0.02, splits))))
+    return found
+
+
+def _pack(programme: Programme, course: Course, splits: np.ndarray) -> np.ndarray:
+    times = np.asarray(programme.times(splits)).ravel()
+    states = np.stack([np.interp(times, course.u, course.p), np.interp(times, course.u, course.w)], axis=1)
+    x = np.concatenate([course.tau.ravel(), splits, states.ravel(), [course.least]])
+    return np.clip(x, programme.bounds["lbx"], programme.bounds["ubx"])
+
+
+def _unpack(programme: Programme, x: np.ndarray) -> tuple[Course, np.ndarray]:
+    torques = 2 * programme.knots
+    splits = x[torques : torques + programme.splits]
+    p, w = x[torques + programme.splits : -1].reshape(-1, 2).T
+    u = np.append(0.0, np.asarray(programme.times(splits)).ravel())
+    return Course(u, np.append(0.0, p), np.append(0.0, w), x[:torques].reshape(-1, 2), float(x[-1])), splits
+
+
+def _resimulated(table: Table, phase: Phase, torque: np.ndarray) -> tuple[float, str, float]:
+    """Margin [N], status and distance left to the wire's end [wire lengths] of the honest simulation."""
+    schedule = padded(wa.torque(np.linspace(0, phase.duration, phase.knots), torque))
+    outcome = run(table, schedule, jnp.zeros(()), jnp.asarray(phase.duration), Integration(), True)
+    last = float(outcome.motion.s[int(outcome.motion.count)])
+    status = wa.Status(int(outcome.verdict.status))
+    return float(outcome.score.margin), status.label, (float(table.breaks[-1]) - last) / float(table.length)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--duration", type=float, default=1.0, help="of every phase [s]")
+    parser.add_argument("--knots", type=int, default=KNOTS, help="torques a joint")
+    parser.add_argument("--refine", type=int, default=1, help="refine to this many collocation intervals between knots")
+    parser.add_argument("scenes", nargs="*", default=["heptagon", "hexagon"], help="bundled scenes or files")
+    chosen = parser.parse_args()
+    print("scene        phase          IPOPT  simulated  bound [N]  status          missed  iter  build  solve [s]")
+    for name in chosen.scenes:
+        scene = wa.load(name)
+        scene = eqx.tree_at(lambda s: [p.duration for p in s.phases], scene, [chosen.duration] * len(scene.phases))
+        traced = wa.trace(scene)
+        for phase, at, top in zip(scene.phases, traced, wa.bounds(scene, traced=traced), strict=True):
+            one = collocate(at.table, chosen.duration, knots=chosen.knots)
+            if chosen.refine > 1:
+                one = refined(at.table, chosen.duration, one, refine=chosen.refine)
+            forces = f"{one.course.least:7.4f} {one.margin:10.4f} {float(top.value):10.4f}"
+            cost = f"{one.iterations:5d} {one.build:6.2f} {one.solve:6.2f}"
+            failed = "" if one.ipopt in CONVERGED else f"  {one.ipopt}"
+            name = str(name)[-12:]
+            print(
+                f"{name:12s} {phase.name:12s} {forces}  {one.verdict:14s} {one.missed:7.0e} {cost}{failed}", flush=True
+            )
+
+
+if __name__ == "__main__":
+    main()
