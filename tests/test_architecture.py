@@ -11,7 +11,7 @@ from wholearm_jax import plan
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
     *("status", "scene", "contacts", "system", "newton", "wire", "reduction", "schedule", "motion", "forces"),
-    *("verdict", "plan", "squeeze", "descent", "optimiser", "baseline"),
+    *("verdict", "plan", "squeeze", "shooting", "descent", "optimiser", "baseline"),
     *("writing", "scene_file", "result_file", "drawing", "__init__", "command"),
 )
 

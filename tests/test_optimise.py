@@ -7,6 +7,7 @@ import optax
 import pytest
 
 import wholearm_jax as wa
+from wholearm_jax.descent import COLDEST, JOINED
 from wholearm_jax.plan import simulate
 from wholearm_jax.verdict import ARRIVAL
 
@@ -20,12 +21,12 @@ def optimised(request):
     return request.param, scene, wa.optimise(scene)
 
 
-def test_every_phase_reaches_97_percent_of_the_bound(optimised):
+def test_every_phase_reaches_99_percent_of_the_bound(optimised):
     name, _, found = optimised
     for phase, top, known in zip(found.result.phases, found.bounds, BOUNDS[name], strict=True):
         assert phase.status is wa.Status.OK
         assert float(top.value) == pytest.approx(known, abs=6e-4)
-        assert phase.margin >= 0.97 * float(top.value)
+        assert phase.margin >= 0.99 * float(top.value)
         assert phase.margin <= float(top.value) + 1e-9, "no torque can beat the bound"
 
 
@@ -45,8 +46,10 @@ def test_history_says_what_happened(optimised):
     assert len(found.stopped) == 2
     assert all(found.stopped)
     for row, phase in enumerate(found.result.phases):
-        good = [step.margin for step in found.history if step.phase == row and step.status is wa.Status.OK]
-        assert phase.margin == pytest.approx(max(good), rel=1e-9), "the best step is kept"
+        steps = [step for step in found.history if step.phase == row]
+        assert [step.step for step in steps if step.start == 0] == list(range(sum(s.start == 0 for s in steps)))
+        ends = [step for step in steps if step.apart < JOINED and step.temperature <= COLDEST]
+        assert phase.margin == pytest.approx(max(step.margin for step in ends), rel=3e-3), "samples of joined intervals"
 
 
 def test_the_search_is_beaten_in_margin(optimised):
@@ -61,7 +64,7 @@ def test_the_search_is_beaten_in_margin(optimised):
 def test_rate_limits_hold_in_the_result():
     scene = wa.load("hexagon")
     scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
-    found = wa.optimise(scene, rate_limit=2.0, steps=40)
+    found = wa.optimise(scene, rate_limit=2.0)
     assert found.result.status is wa.Status.OK
     rates = np.diff(np.asarray(found.torque.values), axis=0) / np.diff(np.asarray(found.torque.times))[:, None]
     assert np.abs(rates).max() <= 2.0 + 1e-9
@@ -70,19 +73,20 @@ def test_rate_limits_hold_in_the_result():
 def test_durations_are_free_within_their_range():
     scene = wa.load("hexagon")
     scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
-    fixed = wa.optimise(scene, steps=15)
-    free = wa.optimise(scene, durations=(0.5, 2.0), steps=15)
+    fixed = wa.optimise(scene)
+    free = wa.optimise(scene, durations=(0.5, 2.0))
     assert 0.5 <= float(free.scene.phases[0].duration) <= 2.0
     assert float(free.scene.phases[0].duration) != pytest.approx(1.0, abs=1e-3)
-    assert free.result.margin >= 0.97 * fixed.result.margin
+    assert free.result.margin >= 0.999 * fixed.result.margin
 
 
 def test_any_optax_optimiser_descends():
-    scene = wa.load("hexagon")
-    scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
-    found = wa.optimise(scene, optimiser=optax.adam(3e-3), steps=12)
-    good = [step.margin for step in found.history if step.status is wa.Status.OK]
-    assert max(good) > good[0]
+    found = wa.optimise(wa.load("heptagon"), optimiser=optax.adam(3e-3), steps=100, knots=31)
+    flip = [step for step in found.history if step.phase == 1 and step.start == 0]
+    joined = [step.margin for step in flip if step.apart < 1e-3]
+    assert joined[-1] > joined[0] + 0.02
+    assert found.result.phases[1].margin > 0.9 * joined[-1]
+    assert float(jnp.abs(found.torque.values).max()) <= 1.0
 
 
 def test_a_formation_that_cannot_be_held_is_said_before_any_search():

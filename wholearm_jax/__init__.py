@@ -1,8 +1,8 @@
 """Differentiable dynamics and torque-trajectory optimisation for planar whole-arm manipulation.
 
 Read the modules in this order: `scene`, `contacts`, `system`, `wire` (trace), `reduction` (reduce), `schedule`,
-`motion` (simulate), `forces` (score), `verdict`, `plan`, `squeeze` (quasi-static torques and the bound), `descent` and
-`optimiser` (optimise), `baseline` (the paper's search).
+`motion` (simulate), `forces` (score), `verdict`, `plan`, `squeeze` (quasi-static torques and the bound), `shooting`,
+`descent` and `optimiser` (optimise), `baseline` (the paper's search).
 """
 
 from wholearm_jax.baseline import search

@@ -64,8 +64,8 @@ def optimise(
     scene: SceneName,
     out: Out = None,
     set_: Changes = None,
-    knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase.")] = 31,
-    steps: Annotated[int, typer.Option(min=1, help="Most steps of descent a phase.")] = 120,
+    knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase.")] = 51,
+    steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 120,
     rate_limit: Annotated[float | None, typer.Option(min=0.0, help="Largest torque rate [N m/s].")] = None,
     samples: Samples = 201,
 ) -> None:
@@ -84,7 +84,7 @@ def optimise(
         bars = [progress.add_task(p.name, total=steps, state="waiting") for p in loaded.phases]
 
         def show(step):
-            state = f"margin {step.margin:.4f} N, {step.status.label}"
+            state = f"margin {step.margin:.4f} N, apart {step.apart:.0e}"
             progress.update(bars[step.phase], completed=step.step + 1, state=state)
 
         progress.update(bars[0], state="compiling")

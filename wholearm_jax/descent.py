@@ -1,18 +1,18 @@
-r"""Descend: torque knots of one phase, improved by gradient descent through the simulation.
+r"""Descend: the torques of one phase, improved by gradient descent through the simulation of its intervals.
 
-The variables `p` are the torques at the knots, in units of the torque limit, and the logarithm of the duration. The
-loss is minus the smooth margin (`forces.smooth_margin`) plus logarithmic barriers of the same temperature on torque,
-rate and duration limits. Arrival at rest, `e(p) = (s(T) - s_end, w(T)) / length = 0`, is an equality constraint.
+The variables `p` are those of `shooting`. With forces `c_i`, in units of the bound, and all other rooms `r_j` (within
+the limits on torques, their rates, speeds and the duration), the loss at temperature `T` is minus the smooth margin
 
-Descent is preconditioned: with `J` the derivatives of the sampled forces, `H = J^T phi'' J` (the Gauss-Newton metric of
-the loss, plus the barriers' own) and `E = de/dp`, the direction solves
+    max_m [ m + T sum_i w_i log(c_i - m) ] + T sum_j w_j log r_j
 
-    [ H  E^T ] [ d ]     [ grad ]
-    [ E   0  ] [ . ] = - [   e  ]
+subject to the intervals joining and the last ending at rest at the wire's end, `e(p) = 0`. Its maximum lies less than
+`T` times the sum of weights below the largest margin. The direction comes from Newton's method on the conditions of
+that maximum, the products `slack * price = T w` being unknowns of their own (a primal-dual interior point); the
+curvature of the simulation itself is left out (Gauss-Newton). It is an optax gradient transformation, and any other
+optax optimiser may take its place (`projected`).
 
-so that neither units, nor an unstable motion, nor the number of knots slows it. The direction is an optax gradient
-transformation; any other optax optimiser may take its place (`projected`). A step counts only after its return to the
-arrival, and is shortened until it lowers the loss there.
+A step follows the curve on which accelerations and squeezes at the knots change evenly (`moved`): on it the intervals
+are nearly linear. Source of the interior point: J. Nocedal and S. J. Wright, Numerical Optimization, 2006, chapter 19.
 """
 
 from typing import NamedTuple
@@ -20,212 +20,345 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
-from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.forces import arcs, on_arc, sampled_forces, smooth_margin
-from wholearm_jax.motion import Integration, move
+from wholearm_jax.forces import smooth_margin
+from wholearm_jax.motion import Integration
 from wholearm_jax.reduction import Table
-from wholearm_jax.schedule import Torque, window
+from wholearm_jax.shooting import PARTS, SAMPLES, STEPS, Variables, local, shoot
+from wholearm_jax.squeeze import coefficients
 
-SAMPLES = 4  # forces a step that the loss sees
-ARRIVED = 1e-11  # arrival error, in wire lengths, below which a step counts as having arrived
-RETURNS, CUTS, SHORTER = 8, 10, 0.4  # Newton steps back to the arrival, shortenings of a step, and by how much
+HOTTEST, COLDEST = 0.1, 1e-4  # temperatures, as shares of the bound
+NEAR = 0.95  # share of the way to a limit that a step may go
+LEAST = 0.05  # slack that a room starts with at least
+LONGEST = (0.1, 0.5)  # most that `s` and `v` at a knot may change in a step [lengths, lengths a duration]
+SHORTER = 0.25  # a step that leaves what can be simulated is taken again with this share of it
+JOINED = 1e-9  # sum of the defects below which the intervals count as joined
 
 
 class Limits(eqx.Module):
-    """What the result must respect: torque rates [N m/s], durations [s], and which knots stay as they are."""
+    """What the result must respect: torque rates [N m/s], durations [s], which knots' torques stay as they are; and
+    the `unit` of forces [N]."""
 
     rate: Float[Array, "2"]
     shortest: Float[Array, ""]
     longest: Float[Array, ""]
     pinned: Bool[Array, "knots"]
+    unit: Float[Array, ""]
+
+
+class Rooms(NamedTuple):
+    """Of each interval: what must stay positive (forces over the margin, the others over zero), with weights (0: does
+    not exist), and the state in which the interval ends."""
+
+    room: Float[Array, "*intervals rooms"]
+    weight: Float[Array, "*intervals rooms"]
+    end: Float[Array, "*intervals 2"]
 
 
 class Linear(NamedTuple):
-    """The loss and the arrival at `p`, with their derivatives."""
+    """All intervals at `p` with derivatives: `at` and `rates` (last axis: an interval's seven numbers), the defects `e`
+    and `E = de/dp`; `bears` marks the rooms that the margin lowers, `still` the variables that stay."""
 
-    loss: Float[Array, ""]
-    gradient: Float[Array, "p"]
-    metric: Float[Array, "p p"]
-    arrival: Float[Array, "2"]
-    arrival_rows: Float[Array, "2 p"]
-
-
-def pack(values: Float[Array, "knots 2"], duration: Float[Array, ""], table: Table) -> Float[Array, "p"]:
-    """Torques at the knots and a duration as variables."""
-    return jnp.concatenate([(values / table.torque_limit).ravel(), jnp.log(duration)[None]])
+    at: Rooms
+    rates: Rooms
+    defect: Float[Array, "intervals 2"]
+    across: Float[Array, "e p"]
+    bears: Float[Array, "rooms"]
+    still: Bool[Array, "p"]
 
 
-def unpack(p: Float[Array, "p"], table: Table) -> tuple[Torque, Float[Array, ""]]:
-    """Variables as a schedule from time 0, knots evenly spaced, and a duration."""
-    values = p[:-1].reshape(-1, 2) * table.torque_limit
-    duration = jnp.exp(p[-1])
-    return Torque(jnp.linspace(0.0, 1.0, values.shape[0]) * duration, values), duration
-
-
-def observe(p, table: Table, how: Integration):
-    """Sampled forces, their weights (shares of time), and the arrival error of the free motion under `p`."""
-    schedule, duration = unpack(p, table)
-    # Knots are fixed shares of the phase: only the torques and the duration carry derivatives.
-    seen = window(schedule, jnp.zeros(()), duration)
-    seen = eqx.tree_at(lambda w: w.share, seen, stop_gradient(seen.share))
-    motion = move(table, seen, duration, how=how, free=True)
-    steps = arcs(table, seen, duration, motion)
-    forces = sampled_forces(table, seen, duration, steps, SAMPLES)
-    width = stop_gradient(steps.share[:, 1] - steps.share[:, 0])
-    weights = jnp.where((steps.live & ~steps.held)[:, None, None], width[:, None, None] / SAMPLES, 0.0)
-    weights = jnp.broadcast_to(weights, forces.shape)
-    share, _, pace = jax.vmap(jax.vmap(on_arc, (None, 0)), (0, None))(steps, jnp.linspace(0.0, 1.0, SAMPLES))
-    pace = pace / table.length
-    inside = (weights[..., 0] > 0) & (share > 1e-9) & (share < 1 - 1e-9)
-    pace = jnp.where(inside, pace, 1.0)
-    arrival = jnp.stack([motion.s[-1] - table.breaks[-1], motion.w[-1]]) / table.length
-    return jnp.where(weights > 0, forces, 0.0), weights, pace, arrival
-
-
-def barrier(p, table: Table, limits: Limits):
-    """`-sum log` of the room within torque, rate and duration limits, each group weighing one."""
-    values, duration = p[:-1].reshape(-1, 2), jnp.exp(p[-1])
-    knots = values.shape[0]
+def rooms(q: Float[Array, "7"], later: Float[Array, ""], table: Table, limits: Limits, how, intervals: int) -> Rooms:
+    """One interval; `later` is 0 for the first, which starts at rest, and 1 for the others."""
+    shot = shoot(table, how, intervals, q)
+    torque, log = q[2:6], q[6]
     bounded = jnp.isfinite(limits.rate)
-    step = jnp.where(bounded, limits.rate, 1.0) / table.torque_limit * duration / (knots - 1)
-    climb = jnp.where(bounded, jnp.diff(values, axis=0) / step, 0.0)
-    room = jnp.concatenate([1 - values**2, 1 - climb**2])
+    step = jnp.where(bounded, limits.rate, 1.0) / table.torque_limit * jnp.exp(log) / intervals
+    climb = jnp.where(bounded, (torque[2:] - torque[:2]) / step, 0.0)
     span = jnp.log(limits.longest / limits.shortest)
     free = span > 0
-    ends = jnp.stack([p[-1] - jnp.log(limits.shortest), jnp.log(limits.longest) - p[-1]]) / jnp.where(free, span, 1.0)
-    ends = jnp.where(free, ends, 1.0)
-    return -jnp.log(room).sum() / knots - jnp.log(ends).sum()
+    ends = jnp.stack([log - jnp.log(limits.shortest), jnp.log(limits.longest) - log]) / jnp.where(free, span, 1.0)
+    room = [(shot.forces / limits.unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, shot.pace, ends]
+    one = jnp.full((), 1 / intervals)
+    sampled = jnp.repeat(shot.weight, shot.forces.shape[1])
+    climbs = jnp.tile(jnp.where(bounded, one / 4, 0.0), 2)
+    paces = jnp.full(STEPS, one).at[0].multiply(later)
+    weight = [sampled, jnp.full(8, one / 4), climbs, paces, jnp.full(2, jnp.where(free, one / 4, 0.0))]
+    return Rooms(jnp.concatenate(room), jnp.concatenate(weight), shot.end)
 
 
-@eqx.filter_jit
-def linearise(p, table: Table, limits: Limits, temperature, how: Integration) -> Linear:
-    """Loss, gradient, Gauss-Newton metric and arrival at `p`, by forward mode through the simulation."""
+def linearise(p: Variables, table: Table, limits: Limits, how: Integration) -> Linear:
+    """Simulate all intervals, with first derivatives by forward mode."""
+    knots = p.torque.shape[0]
 
-    def both(p):
-        forces, weights, pace, arrival = observe(p, table, how)
-        return (forces, pace, arrival), (forces, weights, pace, arrival)
+    def both(q, later):
+        at = rooms(q, later, table, limits, how, knots - 1)
+        return at, at
 
-    (rows, pace_rows, arrival_rows), (forces, weights, pace, arrival) = jax.jacfwd(both, has_aux=True)(p)
-    value, m = smooth_margin(forces, weights, temperature)
-    room = jnp.where(weights > 0, forces - m, 1.0)
-    share = (temperature * weights / room).ravel()
-    curve = (temperature * weights / room**2).ravel()
-    rows = rows.reshape(-1, p.shape[0])
-    middle = curve @ rows
-    metric = (rows * curve[:, None]).T @ rows - jnp.outer(middle, middle) / curve.sum()
-    metric, pull_back, backward = _keep_moving(metric, pace, weights, pace_rows, temperature)
-    wall, pull, bend = (
-        barrier(p, table, limits),
-        jax.grad(barrier)(p, table, limits),
-        jax.hessian(barrier)(p, table, limits),
-    )
-    still = jnp.concatenate([jnp.repeat(limits.pinned, 2), (limits.longest <= limits.shortest)[None]])
-    gradient = jnp.where(still, 0.0, -share @ rows + temperature * pull - pull_back)
-    metric = jnp.where(still[:, None] | still[None], 0.0, metric + temperature * bend)
-    metric = metric + jnp.diag(jnp.where(still, 1.0, 1e-9 * jnp.trace(metric) / p.shape[0]))
-    return Linear(
-        -value + temperature * wall + backward, gradient, metric, arrival, jnp.where(still, 0.0, arrival_rows)
-    )
+    rates, at = jax.vmap(jax.jacfwd(both, has_aux=True))(local(p), (np.arange(knots - 1) > 0) * 1.0)
+    columns, ends = _columns(knots)
+    each = np.arange(2 * (knots - 1))
+    across = jnp.zeros((2 * (knots - 1), 4 * knots + 1))
+    across = across.at[each[:, None], np.repeat(columns, 2, axis=0)].add(rates.end.reshape(-1, columns.shape[1]))
+    across = across.at[each, ends.ravel()].add(-1.0)
+    still = _still(limits, knots)
+    bears = np.arange(at.room.shape[1]) < PARTS * STEPS * SAMPLES * table.force.shape[2]
+    return Linear(at, rates, at.end - p.state[1:], jnp.where(still, 0.0, across), jnp.asarray(bears * 1.0), still)
 
 
-def _keep_moving(metric, pace, weights, rows, temperature):
-    """Add the barrier `-T sum w log(speed)` to a metric; its gradient's negative and its value."""
-    each = temperature * weights[..., 0]
-    # A start may turn back: there the loss is infinite (see `merit`), and the gradient still has to point forward.
-    backward = -(each * jnp.log(pace)).sum()
-    pace = jnp.maximum(pace, 1e-3)
-    rows = rows.reshape(-1, rows.shape[-1])
-    pull = (each / pace).ravel()
-    return metric + (rows * (each / pace**2).ravel()[:, None]).T @ rows, pull @ rows, backward
+def _columns(knots: int) -> tuple[Int[np.ndarray, "intervals 7"], Int[np.ndarray, "intervals 2"]]:
+    """Where in the flattened `Variables` each interval's seven numbers and its end state stand."""
+    torque, state = np.arange(2 * knots).reshape(knots, 2), np.arange(2 * knots, 4 * knots).reshape(knots, 2)
+    duration = np.full((knots - 1, 1), 4 * knots)
+    return np.concatenate([state[:-1], torque[:-1], torque[1:], duration], axis=1), state[1:]
 
 
-def merit(p, table: Table, limits: Limits, temperature, how: Integration):
-    """The loss and the arrival error of `p`; the loss is infinite outside the limits or where the motion turns back."""
-    forces, weights, pace, arrival = observe(p, table, how)
-    value, _ = smooth_margin(forces, weights, temperature)
-    backward = -(weights[..., 0] * jnp.log(pace)).sum()
-    total = -value + temperature * (barrier(p, table, limits) + backward)
-    allowed = jnp.all(jnp.abs(p[:-1]) < 1) & jnp.isfinite(total)
-    return jnp.where(allowed, total, jnp.inf), arrival
+def _still(limits: Limits, knots: int) -> Bool[Array, "p"]:
+    """Pinned torques, the first and last state, and a fixed duration."""
+    ends = np.zeros((knots, 2), bool)
+    ends[[0, -1]] = True
+    fixed = limits.longest <= limits.shortest
+    return jnp.concatenate([jnp.repeat(limits.pinned, 2), jnp.asarray(ends.ravel()), fixed[None]])
 
 
-def preconditioned() -> optax.GradientTransformationExtraArgs:
-    """The preconditioned, arrival-keeping descent direction as an optax transformation; wants `linear=`."""
-
-    def update(updates, state, params=None, *, linear: Linear, **_):
-        n = updates.shape[0]
-        top = jnp.concatenate([linear.metric, linear.arrival_rows.T], axis=1)
-        bottom = jnp.concatenate([linear.arrival_rows, jnp.zeros((2, 2), top.dtype)], axis=1)
-        right = jnp.concatenate([updates, linear.arrival])
-        return -jnp.linalg.solve(jnp.concatenate([top, bottom]), right)[:n], state
-
-    return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)  # pyright: ignore[reportArgumentType]
+def _gather(linear: Linear, values: Float[Array, "intervals rooms"]) -> Float[Array, "p"]:
+    """`J^T values`, with `J` the derivatives of all rooms."""
+    knots = linear.at.room.shape[0] + 1
+    columns, _ = _columns(knots)
+    pull = jnp.zeros(4 * knots + 1).at[columns].add(jnp.einsum("kr,krq->kq", values, linear.rates.room))
+    return jnp.where(linear.still, 0.0, pull)
 
 
-def projected(optimiser: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
-    """Any optax optimiser, its updates projected onto the arrival's tangent, with a least step back to it."""
+def _metric(linear: Linear, values: Float[Array, "intervals rooms"]) -> Float[Array, "p p"]:
+    """`J^T diag(values) J`, the identity for variables that stay."""
+    knots, still = linear.at.room.shape[0] + 1, linear.still
+    columns, _ = _columns(knots)
+    n = 4 * knots + 1
+    blocks = jnp.einsum("kr,krq,krp->kqp", values, linear.rates.room, linear.rates.room)
+    metric = jnp.zeros((n, n)).at[columns[:, :, None], columns[:, None, :]].add(blocks)
+    return jnp.where(still[:, None] | still, 0.0, metric) + jnp.diag(jnp.where(still, 1.0, 1e-8))
+
+
+class Duals(NamedTuple):
+    """The interior point's own unknowns: slack and price of every room, the level `m` of the margin (NaN: not yet
+    chosen), the temperature, and the shares of its last step that were taken."""
+
+    slack: Float[Array, "intervals rooms"]
+    price: Float[Array, "intervals rooms"]
+    level: Float[Array, ""]
+    temperature: Float[Array, ""]
+    steps: Float[Array, "2"]
+
+
+def interior_point() -> optax.GradientTransformationExtraArgs:
+    """The primal-dual direction as an optax transformation; wants `linear=`, and makes its own gradient from it."""
+
+    def init(params):
+        intervals, contacts = (params.shape[0] - 1) // 4 - 1, 4
+        shape = (intervals, PARTS * STEPS * SAMPLES * contacts + 8 + 4 + STEPS + 2)
+        start = jnp.full((), HOTTEST)
+        return Duals(jnp.ones(shape), jnp.zeros(shape), jnp.full((), jnp.nan), start, jnp.zeros(2))
+
+    def update(updates, state: Duals, params=None, *, linear: Linear, **_):
+        at, bears, hot = linear.at, linear.bears, state.temperature
+        live = at.weight > 0
+        least = jnp.where(live & (bears > 0), at.room, jnp.inf).min()
+        level = jnp.where(jnp.isnan(state.level), least - 2 * LEAST, state.level)
+        given = jnp.where(live, at.room - bears * level, 1.0)
+        fresh = ~(state.price > 0)
+        slack = jnp.where(live, jnp.maximum(given, jnp.where(fresh, LEAST, state.slack)), 1.0)
+        target = hot * at.weight / slack
+        price = jnp.where(live, jnp.where(fresh, target, state.price), 0.0)
+        stiff = price / slack
+        miss = given - slack
+        aim = jnp.where(live, target - stiff * miss, 0.0)
+        way, rise = _solve(linear, stiff, aim)
+        columns, _ = _columns(at.room.shape[0] + 1)
+        dslack = jnp.einsum("krq,kq->kr", linear.rates.room, way[columns]) - bears * rise + miss
+        dslack = jnp.where(live, dslack, 0.0)
+        dprice = jnp.where(live, target - price - stiff * dslack, 0.0)
+        primal = jnp.minimum(_reach(slack, dslack), _cap(way))
+        dual = _reach(price, dprice)
+        both = jnp.minimum(primal, dual)
+        cooling = jnp.where(both > 0.5, 0.2, jnp.where(both > 0.2, 0.6, 1.0))
+        state = Duals(
+            slack + primal * dslack,
+            price + dual * dprice,
+            level + primal * rise,
+            jnp.maximum(hot * cooling, COLDEST),
+            jnp.stack([primal, dual]),
+        )
+        return primal * way, state
+
+    return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
+
+
+def _solve(linear: Linear, stiff, aim):
+    """The step of `p` and of the margin's level: one symmetric system with the joining of the intervals."""
+    bears, across = linear.bears, linear.across
+    n, e = across.shape[1], across.shape[0]
+    lean = _gather(linear, stiff * bears)
+    matrix = jnp.zeros((n + 1 + e, n + 1 + e))
+    matrix = matrix.at[:n, :n].set(_metric(linear, stiff)).at[n, n].set((stiff * bears).sum())
+    matrix = matrix.at[:n, n].set(-lean).at[n, :n].set(-lean)
+    matrix = matrix.at[:n, n + 1 :].set(across.T).at[n + 1 :, :n].set(across)
+    right = [_gather(linear, aim), (1 - (bears * aim).sum())[None], -linear.defect.ravel()]
+    step = jnp.linalg.solve(matrix, jnp.concatenate(right))
+    return step[:n], step[n]
+
+
+def _reach(value, change):
+    """The share of a change that keeps every value positive."""
+    falls = change < 0
+    return jnp.minimum(1.0, NEAR * jnp.where(falls, -value / jnp.where(falls, change, 1.0), jnp.inf).min())
+
+
+def _cap(way):
+    """The share of a step that keeps the states' changes within `LONGEST`."""
+    knots = (way.shape[0] - 1) // 4
+    change = jnp.abs(way[2 * knots : 4 * knots].reshape(knots, 2)).max(0)
+    return (jnp.array(LONGEST) / jnp.maximum(change, 1e-30)).min()
+
+
+def _split(knots: int) -> tuple[Int[np.ndarray, "free"], Int[np.ndarray, "states"]]:
+    """Places in the flattened variables of torques and duration, and of all states but the first."""
+    return np.append(np.arange(2 * knots), 4 * knots), np.arange(2 * knots + 2, 4 * knots)
+
+
+def _follow(linear: Linear, free, states):
+    """How the states follow the torques and the duration where the intervals join: `follow @ change + apart`."""
+    across = linear.across.at[[-2, -1], states[-2:]].set(-1.0)
+    solved = jnp.linalg.solve(across[:, states], jnp.column_stack([across[:, free], linear.defect.ravel()]))
+    return -solved[:, :-1], -solved[:, -1]
+
+
+class Cooling(NamedTuple):
+    """State of `projected`: the inner optimiser's, the level `m` of the smooth margin, and the temperature."""
+
+    inner: optax.OptState
+    level: Float[Array, ""]
+    temperature: Float[Array, ""]
+    steps: Float[Array, "2"]
+
+
+def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) -> optax.GradientTransformationExtraArgs:
+    """Any optax optimiser on torques and duration: the states follow so that the intervals join, and its updates are
+    projected onto those that arrive. The temperature falls by `cooling` a step."""
     optimiser = optax.with_extra_args_support(optimiser)
 
-    def update(updates, state, params=None, *, linear: Linear, **extra):
-        rows = linear.arrival_rows
-        updates, state = optimiser.update(updates, state, params, **extra)
-        back = rows.T @ jnp.linalg.solve(rows @ rows.T, rows @ jnp.asarray(updates) + linear.arrival)
-        return updates - back, state
+    def init(params):
+        return Cooling(optimiser.init(params), jnp.full((), jnp.nan), jnp.full((), HOTTEST), jnp.zeros(2))
 
-    return optax.GradientTransformationExtraArgs(optimiser.init, update)  # pyright: ignore[reportArgumentType]
+    def update(updates, state: Cooling, params=None, *, linear: Linear, **extra):
+        at, hot = linear.at, state.temperature
+        _, level = smooth_margin(at.room, at.weight * linear.bears, hot)
+        above = at.room - linear.bears * level
+        # Outside a limit the loss is infinite: there the pull back to it is that of a small room.
+        pull = _gather(linear, hot * at.weight / jnp.maximum(above, hot))
+        free, states = _split(at.room.shape[0] + 1)
+        follow, apart = _follow(linear, free, states)
+        last = follow[-2:]
+
+        def arriving(step, rest):
+            return step - last.T @ jnp.linalg.solve(last @ last.T, last @ step + rest)
+
+        gradient = arriving(-pull[free] - follow[:-2].T @ pull[states[:-2]], 0.0)
+        updates, inner = optimiser.update(jnp.zeros_like(pull).at[free].set(gradient), state.inner, params, **extra)
+        step = arriving(jnp.where(linear.still, 0.0, jnp.asarray(updates))[free], apart[-2:])
+        way = jnp.zeros_like(pull).at[free].set(step).at[states[:-2]].set((follow @ step + apart)[:-2])
+        columns, _ = _columns(at.room.shape[0] + 1)
+        change = jnp.einsum("krq,kq->kr", linear.rates.room, way[columns])
+        within = (at.weight > 0) & (linear.bears == 0) & (at.room > 0)
+        share = jnp.minimum(_reach(jnp.where(within, at.room, 1.0), jnp.where(within, change, 0.0)), _cap(way))
+        cooled = jnp.maximum(cooling * hot, COLDEST)
+        return share * way, Cooling(inner, level, cooled, jnp.stack([share, share]))
+
+    return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
 
 
-class Advance(NamedTuple):
-    """A step taken: the new variables, the optimiser's state, the decrease of the loss that the gradient promised, and
-    the share of the direction that was taken (0: none lowered the loss)."""
+def moved(p: Variables, way: Variables, share, table: Table, limits: Limits) -> Variables:
+    """`p` after a `share` of a direction, on the curve along which accelerations and squeezes at knots change evenly.
 
-    p: Float[Array, "p"]
+    Torques balance to a small remainder, the acceleration: where the state at a knot moves, they have to move with it.
+    The curve's tangent is the direction. A knot that passes from one piece of the wire to another goes straight.
+    """
+    limit, length = table.torque_limit, table.length
+
+    def balance(state, log):
+        """Acceleration in lengths a duration squared is `rest + pull . torque`, the squeeze `free . torque`."""
+        motion, _ = coefficients(table, table.breaks[0] + length * state[0])
+        time = jnp.exp(log)
+        v = state[1] * length / time
+        rest = motion[0] + motion[1] * v**2 + motion[2] * v
+        pull = motion[3:] * limit
+        free = jnp.stack([-pull[1], pull[0]]) / jnp.sqrt(jnp.maximum(pull @ pull, 1e-300))
+        return time**2 / length * rest, time**2 / length * pull, free
+
+    def knot(state, torque, dstate, dtorque, pinned):
+        def motion(state, torque, log):
+            rest, pull, free = balance(state, log)
+            return rest + pull @ torque, free @ torque
+
+        tangents = (dstate, dtorque, way.log_duration)
+        (a, squeeze), (da, dsqueeze) = jax.jvp(motion, (state, torque, p.log_duration), tangents)
+        there, straight = state + share * dstate, torque + share * dtorque
+        rest, pull, free = balance(there, p.log_duration + share * way.log_duration)
+        size = pull @ pull
+        curved = pull * (a + share * da - rest) / jnp.where(size > 0, size, 1.0) + free * (squeeze + share * dsqueeze)
+        piece = [(table.breaks[0] + length * s[0] >= table.breaks[1:-1]).sum() for s in (state, there)]
+        return jnp.where((piece[0] == piece[1]) & (size > 0) & ~pinned, curved, straight)
+
+    return Variables(
+        jax.vmap(knot)(p.state, p.torque, way.state, way.torque, limits.pinned),
+        p.state + share * way.state,
+        p.log_duration + share * way.log_duration,
+    )
+
+
+class Descent(NamedTuple):
+    """A descent on its way: variables, the optimiser's state, and the step that led here, to take again if it failed.
+
+    `least` is the smallest sampled force over the bound and `apart` the sum of the defects, both of the variables
+    before the step (NaN where they cannot be simulated).
+    """
+
+    p: Variables
     state: optax.OptState
-    promised: Float[Array, ""]
-    taken: Float[Array, ""]
+    before: Variables
+    way: Variables
+    share: Float[Array, ""]
+    least: Float[Array, ""]
+    apart: Float[Array, ""]
 
 
 @eqx.filter_jit
-def advance(
-    p, state, linear: Linear, table: Table, limits: Limits, temperature, how: Integration, optimiser, first
-) -> Advance:
-    """One step of an optax optimiser, shortened until it lowers the loss after its return to the arrival.
+def begin(p: Variables, optimiser) -> Descent:
+    """A descent before its first step."""
+    zero = jnp.zeros(())
+    return Descent(p, optimiser.init(ravel_pytree(p)[0]), p, jax.tree.map(jnp.zeros_like, p), zero + 1, zero, zero)
 
-    `first` is the share of the direction to try first. The return is Newton's method on the arrival error with the rows
-    of `linear`, by least changes in its metric.
-    """
-    way, state = optimiser.update(linear.gradient, state, p, linear=linear)
-    rows = linear.arrival_rows
-    spread = jnp.linalg.solve(linear.metric, rows.T)
-    back = spread @ jnp.linalg.inv(rows @ spread)
-    promised = -linear.gradient @ way
-    largest = jnp.abs(way[:-1]).max()
-    whole = jnp.minimum(first, 1.0 / jnp.maximum(largest, 1e-30))
 
-    # Where the start is off its arrival or outside the limits, its loss is no measure for the first step.
-    held = jnp.isfinite(linear.loss)
-    comparable = jnp.abs(linear.arrival).max() < 1e-6
+@eqx.filter_jit
+def advance(d: Descent, table: Table, limits: Limits, how: Integration, optimiser) -> Descent:
+    """Simulate, and take a step; where `d.p` cannot be simulated, go back and take a shorter one."""
+    linear = linearise(d.p, table, limits, how)
+    at = linear.at
+    sound = jnp.all(jnp.isfinite(at.room)) & jnp.all(jnp.isfinite(linear.defect))
+    least = jnp.where((at.weight > 0) & (linear.bears > 0), at.room, jnp.inf).min()
+    apart = jnp.abs(linear.defect).sum()
 
-    def step(search):
-        q, share, returns, cuts, _ = search
-        loss, error = merit(q, table, limits, temperature, how)
-        size = jnp.abs(error).max()
-        arrived = size < ARRIVED
-        lower = jnp.isfinite(loss) & ((loss <= linear.loss + 1e-9 * jnp.abs(linear.loss)) | ~comparable) | ~held
-        lost = ~jnp.isfinite(size) | (size > 1.0) | (returns >= RETURNS) | (arrived & ~lower)
-        shorter = share * SHORTER
-        nearer = q - back @ error
-        return (
-            jnp.where(arrived & lower, q, jnp.where(lost, p + shorter * way, nearer)),
-            jnp.where(lost, shorter, share),
-            jnp.where(lost, 0, returns + 1),
-            cuts + lost,
-            arrived & lower,
-        )
+    def onward():
+        flat, unravel = ravel_pytree(d.p)
+        way, state = optimiser.update(jnp.zeros_like(flat), d.state, flat, linear=linear)
+        way = unravel(way)
+        return Descent(moved(d.p, way, 1.0, table, limits), state, d.p, way, jnp.ones(()), least, apart)
 
-    begin = (p + whole * way, whole, jnp.asarray(0), jnp.asarray(0), jnp.asarray(False))
-    q, share, _, _, done = jax.lax.while_loop(lambda s: ~s[4] & (s[3] < CUTS), step, begin)
-    return Advance(jnp.where(done, q, p), state, promised, jnp.where(done, share, 0.0))
+    def again():
+        share = d.share * SHORTER
+        nan = jnp.full((), jnp.nan)
+        return d._replace(p=moved(d.before, d.way, share, table, limits), share=share, least=nan, apart=nan)
+
+    return jax.lax.cond(sound, onward, again)

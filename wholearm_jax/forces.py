@@ -48,40 +48,42 @@ class Arcs(eqx.Module):
 
 
 def arcs(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion) -> Arcs:
-    """Quintic Hermite arcs in `xi` in [0, 1] between the steps' ends."""
+    """The steps of a motion as arcs."""
     live = jnp.arange(motion.held.shape[0]) < motion.count
-    width = motion.share[1:] - motion.share[:-1]
-    s0, s1 = motion.s[:-1], motion.s[1:]
-    d0, d1 = motion.entry_w * width, motion.w[1:] * width
+    ends = [jnp.stack([a[:-1], a[1:]], axis=1) for a in (motion.share, motion.s)]
+    w = jnp.stack([motion.entry_w, motion.w[1:]], axis=1)
+    each = jax.vmap(arc, (None, None, None, 0, 0, 0, 0, 0, 0))
+    quintic = each(table, seen, duration, *ends, w, motion.piece, motion.row, live & ~motion.held)
+    return Arcs(ends[0], quintic, motion.piece, motion.row, motion.held, live)
 
-    def bend(share, s, w):
-        at = jax.vmap(lambda *place: acceleration(table, seen, duration, *place))
-        return at(motion.piece, motion.row, share, s, w) * width**2
 
-    moving = live & ~motion.held
-    d0, d1 = jnp.where(moving, d0, 0.0), jnp.where(moving, d1, 0.0)
-    ends = [motion.share[:-1], motion.share[1:]], [s0, s1], [motion.entry_w, motion.w[1:]]
-    b0, b1 = jnp.where(moving, jax.vmap(bend)(*map(jnp.stack, ends)), 0.0)
-    rise = s1 - s0
+def arc(table: Table, seen: Window, duration, share, s, w, piece, row, moving) -> Float[Array, "6"]:
+    """The quintic Hermite arc in `xi` in [0, 1] between a step's two ends; `s` stays where nothing moves."""
+    width = share[1] - share[0]
+    bend = jax.vmap(acceleration, (None, None, None, None, None, 0, 0, 0))(
+        table, seen, duration, piece, row, share, s, w
+    )
+    d0, d1 = jnp.where(moving, w * width, 0.0)
+    b0, b1 = jnp.where(moving, bend * width**2, 0.0)
+    rise = s[1] - s[0]
     quintic = [
-        s0,
+        s[0],
         d0,
         b0 / 2,
         10 * rise - 6 * d0 - 4 * d1 - 1.5 * b0 + b1 / 2,
         -15 * rise + 8 * d0 + 7 * d1 + 1.5 * b0 - b1,
         6 * rise - 3 * (d0 + d1) - (b0 - b1) / 2,
     ]
-    ends = jnp.stack([motion.share[:-1], motion.share[1:]], axis=1)
-    return Arcs(ends, jnp.stack(quintic, axis=1), motion.piece, motion.row, motion.held, live)
+    return jnp.stack(quintic)
 
 
-def on_arc(arc: Arcs, xi: Float[Array, ""]):
+def on_arc(one: Arcs, xi: Float[Array, ""]):
     """Share, `s` and `w` at `xi` of one arc (no leading axis)."""
-    width = arc.share[1] - arc.share[0]
-    s = horner(arc.quintic, xi)
-    slope = horner(arc.quintic[1:] * jnp.arange(1.0, 6.0), xi)
-    moving = arc.live & ~arc.held & (width > 0)
-    return arc.share[0] + xi * width, s, jnp.where(moving, slope / jnp.where(moving, width, 1.0), 0.0)
+    width = one.share[1] - one.share[0]
+    s = horner(one.quintic, xi)
+    slope = horner(one.quintic[1:] * jnp.arange(1.0, 6.0), xi)
+    moving = one.live & ~one.held & (width > 0)
+    return one.share[0] + xi * width, s, jnp.where(moving, slope / jnp.where(moving, width, 1.0), 0.0)
 
 
 def force(table: Table, seen: Window, duration, piece, row, share, s, w) -> Float[Array, "contacts"]:

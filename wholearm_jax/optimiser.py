@@ -16,35 +16,36 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.descent import SHORTER, Limits, advance, linearise, pack, preconditioned, projected, unpack
+from wholearm_jax.descent import COLDEST, JOINED, Limits, advance, begin, interior_point, projected
 from wholearm_jax.motion import Integration
 from wholearm_jax.plan import Result, Traced, describe, outcomes, require_x64, run, trace
 from wholearm_jax.reduction import blank
 from wholearm_jax.scene import Scene
 from wholearm_jax.schedule import Torque, padded
+from wholearm_jax.shooting import Variables
 from wholearm_jax.squeeze import Bound, bound, holds
 from wholearm_jax.status import Status
 from wholearm_jax.wire import Resolution
 
-HOTTEST, COLDEST, COOLING = 0.1, 2e-4, 0.5  # temperatures as shares of the bound, and the factor from one to the next
-FIRST = 0.9  # share of the torque limits that the start may use
+TORQUE_SHARE = 0.9  # share of the torque limits that a start may use
 PROFILES = tuple((p, q) for p in (1.0, 2.0, 4.0, 8.0, 16.0) for q in (1.0, 2.0, 4.0, 8.0, 16.0))
 FINE = 8  # places a knot interval at which a starting motion is judged
 EVEN = 0.3  # share of the even motion in every profile, so that the object never quite stops on the way
-SMOOTHINGS = 2000  # most passes that bring a start within its rate limits
-PATIENCE = 12  # steps without gain at the lowest temperature before a phase stops
+OTHERS = ((16.0, 1.0), (1.0, 1.0), (1.0, 16.0))  # further starts: a long dwell first, none, a long dwell last
+GOOD = 0.99  # share of the bound with which no further start is tried
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step of the descent: the loss, the margin [N] of the honest simulation and its status, the time it took."""
+    """One step of the descent from one of a phase's starts: the temperature as a share of the bound, the least sampled
+    force [N], how far apart the intervals still are (`shooting`), the time it took [s]."""
 
     phase: int
+    start: int
     step: int
     temperature: float
-    loss: float
     margin: float
-    status: Status
+    apart: float
     seconds: float
 
 
@@ -69,7 +70,7 @@ class Optimised:
         return tuple(p.margin / float(b.value) if float(b.value) > 0 else float("nan") for p, b in pairs)
 
 
-def quasistatic(scene: Scene, *, knots: int = 31, traced: tuple[Traced, ...] = ()) -> Torque:
+def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = ()) -> Torque:
     """The quasi-static torques: at each knot the best squeeze for an even rest-to-rest motion, in closed form.
 
     The motion's speed is `v ~ u^p (1 - u)^q` in `u = t / duration`: the even `p = q = 1` unless another of `PROFILES`
@@ -77,7 +78,9 @@ def quasistatic(scene: Scene, *, knots: int = 31, traced: tuple[Traced, ...] = (
     end, not exactly to it.
     """
     traced = traced or trace(scene)
-    return _joined(scene, [_start(at, p.duration, knots, 1.0) for at, p in zip(traced, scene.phases, strict=True)])
+    pairs = zip(traced, scene.phases, strict=True)
+    starts = [(at.table.torque_limit, _starts(at, p.duration, knots, 1.0)[0]) for at, p in pairs]
+    return _joined(scene, [limit * start.torque for limit, start in starts])
 
 
 def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...]:
@@ -90,7 +93,7 @@ def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...
 def optimise(
     scene: Scene,
     *,
-    knots: int = 31,
+    knots: int = 51,
     steps: int = 120,
     rate_limit: float | None = None,
     durations: tuple[float, float] | None = None,
@@ -107,7 +110,7 @@ def optimise(
     `callback` sees every step. Where no torque can hold a formation, nothing is searched and the status says so.
     """
     require_x64()
-    method = _DESCENT if optimiser is None else projected(optimiser)
+    method = _INTERIOR_POINT if optimiser is None else projected(optimiser)
     with ThreadPoolExecutor(1) as beside:
         ready = beside.submit(_compile, knots, method)
         traced = trace(scene)
@@ -145,49 +148,57 @@ class _Task:
 
 
 def _optimise_phase(task: _Task, limits: Limits, method, callback) -> tuple[Torque, str, list[Step]]:
-    """Descend on one phase; return the best schedule (from time 0), why it stopped, and the steps taken."""
-    table, how = task.traced.table, _HOW
+    """Descend on one phase from one start after the other, until one comes near the bound or two agree; return the
+    best schedule (from time 0), why its descent stopped, and the steps taken."""
+    table = task.traced.table
     if int(table.status) != Status.OK:
-        return (
-            _evenly(task, np.zeros((task.knots, 2))),
-            f"the wire cannot be followed: {Status(int(table.status)).label}",
-            [],
-        )
-    values = _start(task.traced, task.duration, task.knots, FIRST)
+        why = f"the wire cannot be followed: {Status(int(table.status)).label}"
+        return _evenly(task, np.zeros((task.knots, 2))), why, []
+    starts = _starts(task.traced, task.duration, task.knots, TORQUE_SHARE)
     if task.bound <= 0:
         why = f"no torque within limits holds this formation at {100 * task.bound_share:.0f} % of its wire"
-        return _evenly(task, values), why, []
-    if task.pinned is not None:
-        values[0] = np.asarray(task.pinned)
-    p = _pack(_within_rate(values, limits, task), jnp.asarray(np.asarray(task.duration)), table)
-    state, temperature = method.init(p), HOTTEST * task.bound
-    best, best_margin, history, since, share = p, -np.inf, [], 0, 1.0
+        return _evenly(task, starts[0].torque * table.torque_limit), why, []
+    best, best_key, reason, history = starts[0], (False, -np.inf), "", []
+    agree = False
+    for number, start in enumerate(starts):
+        if task.pinned is not None:
+            start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[0].set(task.pinned / table.torque_limit))
+        p, why, taken = _descend(task, start, number, limits, method, callback)
+        history += taken
+        margin, status = _honest(p, table)
+        key = (status is Status.OK, margin if np.isfinite(margin) else -np.inf)
+        agree = key[0] and best_key[0] and abs(key[1] - best_key[1]) <= task.tolerance * task.bound
+        if key > best_key:
+            best, best_key, reason = p, key, why
+        if agree or (best_key[0] and best_key[1] >= GOOD * task.bound):
+            break
+    share = best_key[1] / task.bound
+    reason = f"within {task.tolerance:g} of the bound" if best_key[0] and share >= 1 - task.tolerance else reason
+    return _unpack(best, table)[0], reason, history
+
+
+def _descend(task: _Task, start: Variables, number: int, limits: Limits, method, callback):
+    """One descent: the variables at its end, why it ended, and its steps."""
+    table, history = task.traced.table, []
+    d = begin(start, method)
     why = f"the limit of {task.steps} steps"
     for count in range(task.steps):
         begun = time.perf_counter()
-        heat, first = jnp.asarray(temperature * _ONE), jnp.asarray(min(1.0, share / SHORTER) * _ONE)
-        linear = linearise(p, table, limits, heat, how)
-        p, state, promised, taken = advance(p, state, linear, table, limits, heat, how, method, first)
-        share = float(taken) or 1.0
-        margin, status = _honest(p, table)
-        step = Step(task.index, count, temperature, float(linear.loss), margin, status, time.perf_counter() - begun)
+        after = advance(d, table, limits, _HOW, method)
+        least, apart, hot, shares, share = jax.device_get(
+            (after.least, after.apart, after.state.temperature, after.state.steps, after.share)
+        )
+        margin = float(least) * task.bound
+        step = Step(task.index, number, count, float(hot), margin, float(apart), time.perf_counter() - begun)
         history.append(step)
         if callback is not None:
             callback(step)
-        better = status is Status.OK and margin > best_margin
-        since = 0 if better and margin > best_margin + 0.1 * task.tolerance * task.bound else since + 1
-        if better:
-            best, best_margin = p, margin
-        if best_margin >= (1 - task.tolerance) * task.bound:
-            why = f"within {task.tolerance:g} of the bound"
-            break
-        coldest = temperature <= COLDEST * task.bound
-        if coldest and (since >= PATIENCE or taken == 0):
-            why = "the margin no longer improves"
-            break
-        if promised < temperature or taken == 0:
-            temperature = max(temperature * COOLING, COLDEST * task.bound)
-    return _unpack(best, table)[0], why, history
+        if apart < JOINED and hot <= COLDEST and (shares.min() >= 1 or margin >= (1 - task.tolerance) * task.bound):
+            return d.p, "the margin no longer improves", history
+        if share < LOST:
+            return d.p, "no step leads on", history
+        d = after
+    return d.p, why, history
 
 
 def _compile(knots: int, method) -> None:
@@ -196,52 +207,54 @@ def _compile(knots: int, method) -> None:
         return
     _COMPILED.add((knots, method))
     table = blank(Resolution())
-    limits = Limits(*(jnp.asarray(a) for a in (np.full(2, np.inf), 1.0 * _ONE, 1.0 * _ONE, np.zeros(knots, bool))))
-    p, one = _pack(np.zeros((knots, 2)), jnp.asarray(_ONE), table), jnp.asarray(_ONE)
-    linear = linearise(p, table, limits, one, _HOW)
-    advance(p, method.init(p), linear, table, limits, one, _HOW, method, one)
+    limits = Limits(*(jnp.asarray(a) for a in (np.full(2, np.inf), _ONE, _ONE, np.zeros(knots, bool), _ONE)))
+    p = Variables(*(jnp.asarray(a) for a in (np.zeros((knots, 2)), np.zeros((knots, 2)), np.zeros(()))))
+    advance(begin(p, method), table, limits, _HOW, method)
     _honest(p, table)
 
 
 _COMPILED: set = set()
 _ONE = np.ones(())
-_HOW = Integration(max_steps=128, adjoint="forward")
+_HOW = Integration()
+LOST = 1e-6  # share of a step at which a descent gives up
 
 
 def _evenly(task: _Task, values) -> Torque:
     return Torque(jnp.asarray(np.linspace(0.0, float(task.duration), task.knots)), jnp.asarray(values))
 
 
-_pack = jax.jit(pack)
-
-
 @jax.jit
-def _unpack(p, table):
-    schedule, duration = unpack(p, table)
-    return schedule, duration, padded(schedule)
+def _unpack(p: Variables, table):
+    schedule = p.schedule(table)
+    return schedule, p.duration, padded(schedule)
 
 
-def _honest(p, table) -> tuple[float, Status]:
+def _honest(p: Variables, table) -> tuple[float, Status]:
     _, duration, schedule = _unpack(p, table)
     outcome = run(table, schedule, jnp.zeros(()), duration, Integration(), True)
     return float(outcome.score.margin), Status(int(outcome.verdict.status))
 
 
-def _start(traced: Traced, duration, knots: int, share: float):
-    """Torques at the knots that give, with the best squeeze, the rest-to-rest motion of `PROFILES` that squeezes best.
+def _starts(traced: Traced, duration, knots: int, share: float) -> list[Variables]:
+    """Rest-to-rest motions with the torques that give them, within a `share` of the limits, by the best squeeze.
 
-    The even motion is taken unless another gains more than 2 % of its margin.
+    First that of `PROFILES` with the largest margin (the even one unless another gains more than 2 %), then `OTHERS`.
     """
-    limit = share * np.asarray(traced.table.torque_limit)
-    table = eqx.tree_at(lambda t: t.torque_limit, traced.table, jnp.asarray(limit))
-    length, begin, time = float(table.length), float(table.breaks[0]), float(duration)
+    full = np.asarray(traced.table.torque_limit)
+    table = eqx.tree_at(lambda t: t.torque_limit, traced.table, jnp.asarray(share * full))
+    length, first, time = float(table.length), float(table.breaks[0]), float(duration)
     u = np.linspace(0.0, 1.0, FINE * (knots - 1) + 1)
     motions = [_profile(u, *powers) for powers in PROFILES]
-    s, v, a = (length * np.stack(rows) for rows in zip(*motions, strict=True))
-    held = _holds(table, begin + s, v / time, a / time**2)
+    s, v, a = (np.stack(rows) for rows in zip(*motions, strict=True))
+    held = _holds(table, first + length * s, length * v / time, length * a / time**2)
     margins = np.asarray(held.margin).min(1)
     best = 0 if margins[0] >= margins.max() - 0.02 * abs(margins.max()) else int(np.argmax(margins))
-    return np.clip(np.asarray(held.torque)[best, ::FINE], -limit, limit)
+    order = [best, *(PROFILES.index(other) for other in OTHERS if PROFILES[best] != other)]
+    torque = np.clip(np.asarray(held.torque)[:, ::FINE] / full, -share, share)
+    state = np.stack([s, v], axis=2)[:, ::FINE]
+    state[:, -1] = (1.0, 0.0)
+    log = jnp.asarray(np.log(time))
+    return [Variables(jnp.asarray(torque[k]), jnp.asarray(state[k]), log) for k in order]
 
 
 def _profile(u, p, q):
@@ -259,7 +272,7 @@ def _profile(u, p, q):
 
 
 _holds = jax.jit(jax.vmap(holds, (None, 0, 0, 0)))
-_DESCENT = preconditioned()
+_INTERIOR_POINT = interior_point()
 _bound = jax.jit(bound)
 
 
@@ -268,18 +281,8 @@ def _limits(task: _Task, rate_limit, durations) -> Limits:
     rate = np.full(2, np.inf if rate_limit is None else float(rate_limit))
     pinned = np.zeros(task.knots, bool)
     pinned[0] = task.pinned is not None
-    return Limits(*(jnp.asarray(a) for a in (rate, shortest * _ONE, longest * _ONE, pinned)))
-
-
-def _within_rate(values, limits: Limits, task: _Task):
-    """The knots smoothed until they keep 80 % of the rate limit; the first stays where it is."""
-    largest = 0.8 * np.asarray(limits.rate) * float(task.duration) / (task.knots - 1)
-    for _ in range(SMOOTHINGS):
-        if np.all(np.abs(np.diff(values, axis=0)) <= largest):
-            break
-        values = np.concatenate([values[:1], (values[:-2] + 2 * values[1:-1] + values[2:]) / 4, values[-1:]])
-        values[-1] = values[-2]
-    return values
+    unit = max(task.bound, 1e-300)
+    return Limits(*(jnp.asarray(a) for a in (rate, shortest * _ONE, longest * _ONE, pinned, unit * _ONE)))
 
 
 def _joined(scene: Scene, blocks) -> Torque:

@@ -1,0 +1,96 @@
+"""Intervals simulated on their own: joined, they are the phase; their derivatives are those of differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.descent import Limits, moved
+from wholearm_jax.motion import Integration, move
+from wholearm_jax.plan import trace
+from wholearm_jax.schedule import window
+from wholearm_jax.shooting import Variables, local, shoot
+
+HOW = Integration()
+
+
+@pytest.fixture(scope="module")
+def flip():
+    """The heptagon's flip, whose wire has a slip reversal near its end."""
+    table = trace(wa.load("heptagon"))[1].table
+    assert int(table.count) == 2
+    return table
+
+
+def _moving(table):
+    """An interval that begins shortly before the reversal and crosses it."""
+    reversal = float((table.breaks[1] - table.breaks[0]) / table.length)
+    return jnp.array([reversal - 1e-4, 0.1, 0.10443, -0.94068, 0.30118, -0.94629, 0.0]), reversal
+
+
+def test_an_interval_crosses_a_reversal_as_the_simulation_does(flip):
+    q, reversal = _moving(flip)
+    intervals = 300
+    shot = shoot(flip, HOW, intervals, q)
+    assert float(shot.end[0]) > reversal, "the interval must cross the reversal"
+    assert (np.asarray(shot.weight) > 0).sum() == 20, "two parts of two steps with five samples"
+    values = q[2:6].reshape(2, 2) * flip.torque_limit
+    duration = jnp.exp(q[6]) / intervals
+    seen = window(wa.torque([0.0, float(duration)], values), jnp.zeros(()), duration)
+    s = flip.breaks[0] + flip.length * q[0]
+    motion = move(flip, seen, duration, how=Integration(tolerance=1e-13), s=s, speed=flip.length * q[1])
+    s_end = (motion.s[motion.count] - flip.breaks[0]) / flip.length
+    v_end = motion.w[motion.count] / duration / flip.length
+    np.testing.assert_allclose(shot.end, [s_end, v_end], rtol=1e-9)
+
+
+def test_derivatives_of_an_interval_that_is_cut(flip):
+    q, _ = _moving(flip)
+
+    def everything(q):
+        shot = shoot(flip, HOW, 300, q)
+        return jnp.concatenate([shot.forces.ravel(), shot.pace, shot.end])
+
+    exact = jax.jacfwd(everything)(q)
+
+    def slope(k, h):
+        step = jnp.zeros(7).at[k].set(h)
+        return (everything(q + step) - everything(q - step)) / (2 * h)
+
+    for k in range(7):
+        h = 1e-5
+        richardson = (4 * slope(k, h / 2) - slope(k, h)) / 3
+        np.testing.assert_allclose(exact[:, k], richardson, rtol=1e-5, atol=1e-6 * (jnp.abs(exact[:, k]).max() + 1e-3))
+
+
+def test_joined_intervals_are_the_phase():
+    scene = wa.load("hexagon")
+    scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
+    found = wa.optimise(scene, knots=31)
+    table, motion = found.result.phases[0].traced.table, found.result.phases[0].outcome.motion
+    knots, shares = 31, np.asarray(motion.share)
+    at = [int(np.argmin(np.abs(shares - k / (knots - 1)))) for k in range(knots)]
+    assert np.abs(shares[at] - np.arange(knots) / (knots - 1)).max() < 1e-9, "steps end on the knots"
+    state = np.stack([(motion.s[np.array(at)] - table.breaks[0]), motion.w[np.array(at)]], axis=1) / float(table.length)
+    p = Variables(found.torque.values / table.torque_limit, jnp.asarray(state), jnp.zeros(()))
+    ends = jax.vmap(lambda q: shoot(table, HOW, knots - 1, q).end)(local(p))
+    np.testing.assert_allclose(ends, state[1:], atol=1e-8)
+
+
+def test_a_curved_step_starts_along_its_direction_and_keeps_pinned_torques(flip):
+    rng = np.random.default_rng(3)
+    state = np.stack([np.linspace(0.1, 0.8, 6), np.full(6, 1.0)], axis=1)
+    p = Variables(jnp.asarray(rng.uniform(-0.5, 0.5, (6, 2))), jnp.asarray(state), jnp.zeros(()))
+    way = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), p)
+    pinned = np.zeros(6, bool)
+    pinned[0] = True
+    one = jnp.ones(())
+    limits = Limits(jnp.full(2, jnp.inf), one, one, jnp.asarray(pinned), one)
+    _, tangent = jax.jvp(lambda share: moved(p, way, share, flip, limits), (0.0,), (1.0,))
+    for got, want in zip(jax.tree.leaves(tangent), jax.tree.leaves(way), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-9)
+    there = moved(p, way, 0.05, flip, limits)
+    np.testing.assert_allclose(there.torque[0], p.torque[0] + 0.05 * way.torque[0], rtol=1e-12)
+    assert float(jnp.abs(there.torque[1:] - p.torque[1:] - 0.05 * way.torque[1:]).max()) > 1e-4

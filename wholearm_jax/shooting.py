@@ -1,0 +1,192 @@
+r"""Shoot: one phase cut at its torque knots, every interval simulated from a state that is a variable itself.
+
+The variables of direct multiple shooting are the torques at the knots and the states `(s, v)` there. An interval's
+simulation ends in a state that must equal the next variable; these *defects* vanish at the solution, and the intervals
+together are then the simulation of the phase. Because each interval is short, its end depends on its beginning almost
+linearly, even where the motion as a whole is unstable or starts after a long dwell, and its derivatives are those with
+respect to seven numbers, whatever the number of knots.
+
+An interval is a small phase of its own: time is a share of the interval and `w` the speed in `s` per interval. Where it
+crosses from one piece of the wire to the next (`wire`), it is cut exactly there. States may pass rest and the wire's
+end: the forces continue smoothly there, and only an honest simulation (`motion`) decides what happens.
+
+Source of the method: H. G. Bock and K. J. Plitt, A multiple shooting algorithm for direct solution of optimal control
+problems, IFAC World Congress 1984.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float, Int
+
+from wholearm_jax.forces import Arcs, arc, sampled_forces
+from wholearm_jax.motion import Integration, acceleration, single_step
+from wholearm_jax.reduction import Table
+from wholearm_jax.schedule import Torque, Window
+
+STEPS = 2  # solver steps an interval (and a part of it, where it is cut)
+SAMPLES = 5  # places in a step at which forces are sampled, its ends included
+PARTS = 3  # pieces of the wire that one interval may touch
+LANDINGS = 30  # most Newton steps to the place where an interval is cut
+LANDED = 1e-8  # size of the last one; what is left is taken to first order, an error of its square
+
+
+class Variables(eqx.Module):
+    """What is optimised: torques at the knots in units of their limits, states `(s, v)` at the knots in wire lengths
+    from the wire's start and wire lengths a duration, and the logarithm of the duration [s]."""
+
+    torque: Float[Array, "knots 2"]
+    state: Float[Array, "knots 2"]
+    log_duration: Float[Array, ""]
+
+    def schedule(self, table: Table) -> Torque:
+        """The torque schedule, from time 0."""
+        knots = self.torque.shape[0]
+        return Torque(jnp.linspace(0.0, 1.0, knots) * self.duration, self.torque * table.torque_limit)
+
+    @property
+    def duration(self) -> Float[Array, ""]:
+        """Seconds."""
+        return jnp.exp(self.log_duration)
+
+
+class Shot(NamedTuple):
+    """Intervals simulated: forces [N] at every sample, the sample's share of the phase (0: none), the speed at the
+    interval's start and inside it in wire lengths a duration, and the state at its end as in `Variables`."""
+
+    forces: Float[Array, "*intervals samples contacts"]
+    weight: Float[Array, "*intervals samples"]
+    pace: Float[Array, "*intervals steps"]
+    end: Float[Array, "*intervals 2"]
+
+
+def local(p: Variables) -> Float[Array, "intervals 7"]:
+    """What each interval depends on: `s`, `v`, two torques at either end, log of the duration."""
+    spread = jnp.broadcast_to(p.log_duration, (p.torque.shape[0] - 1, 1))
+    return jnp.concatenate([p.state[:-1], p.torque[:-1], p.torque[1:], spread], axis=1)
+
+
+class _Parts(NamedTuple):
+    """An interval on its way: where it has come to, and the steps of its parts so far, one part a piece of the wire."""
+
+    share: Float[Array, ""]
+    y: Float[Array, "2"]
+    piece: Int[Array, ""]
+    count: Int[Array, ""]
+    when: Float[Array, "parts nodes"]
+    place: Float[Array, "parts nodes 2"]
+    pieces: Int[Array, "parts"]
+
+
+def shoot(table: Table, how: Integration, intervals: int, q: Float[Array, "7"]) -> Shot:
+    """Simulate one interval of a phase of `intervals`.
+
+    An interval that touches more than `PARTS` pieces, or whose cut is not found, ends in NaN.
+    """
+    duration = jnp.exp(q[6]) / intervals
+    values = q[2:6].reshape(2, 2) * table.torque_limit
+    zero = jnp.zeros((), int)
+    seen = Window(jnp.arange(2.0), values, values[1:] - values[:-1], zero, zero)
+    per_interval = table.length / intervals
+    y = jnp.stack([table.breaks[0] + table.length * q[0], per_interval * q[1]])
+    real = jnp.arange(table.breaks.shape[0]) < table.count
+    piece = jnp.maximum(((stop_gradient(y[0]) >= table.breaks) & real).sum() - 1, 0)
+    begin = _Parts(
+        share=jnp.zeros(()),
+        y=y,
+        piece=piece,
+        count=zero,
+        when=jnp.zeros((PARTS, STEPS + 1)),
+        place=jnp.broadcast_to(y, (PARTS, STEPS + 1, 2)),
+        pieces=jnp.broadcast_to(piece, (PARTS,)),
+    )
+
+    def one_part(at: _Parts) -> _Parts:
+        when, place, onward = _to_break(table, seen, duration, how, at)
+        factor = table.factor[jnp.minimum(at.piece + 1, table.factor.shape[0] - 1)]
+        return _Parts(
+            share=jnp.where(onward, when[-1], 1.0),
+            y=place[-1] * jnp.where(onward, jnp.stack([jnp.ones_like(factor), factor]), 1.0),
+            piece=at.piece + onward,
+            count=at.count + 1,
+            when=at.when.at[at.count].set(when),
+            place=at.place.at[at.count].set(place),
+            pieces=at.pieces.at[at.count].set(at.piece),
+        )
+
+    done = jax.lax.while_loop(lambda at: (at.share < 1) & (at.count < PARTS), one_part, begin)
+    steps = _arcs(table, seen, duration, done)
+    forces = sampled_forces(table, seen, duration, steps, SAMPLES).reshape(PARTS * STEPS * SAMPLES, -1)
+    weight = jnp.repeat((done.when[:, -1] - done.when[:, 0]) / (STEPS * SAMPLES * intervals), STEPS * SAMPLES)
+    y = jnp.where(done.share < 1, jnp.nan, done.y)
+    return Shot(
+        forces=jnp.where(weight[:, None] > 0, forces, 0.0),
+        weight=stop_gradient(weight),
+        pace=done.place[0, :-1, 1] / per_interval,
+        end=jnp.stack([(y[0] - table.breaks[0]) / table.length, y[1] / per_interval]),
+    )
+
+
+def _arcs(table, seen, duration, done: _Parts) -> Arcs:
+    """The steps of all parts."""
+    pairs = [jnp.stack([a[:, :-1], a[:, 1:]], axis=2) for a in (done.when, done.place[..., 0], done.place[..., 1])]
+    share, s, w = (a.reshape(PARTS * STEPS, 2) for a in pairs)
+    piece = jnp.repeat(done.pieces, STEPS)
+    row, held = jnp.zeros_like(piece), jnp.zeros(piece.shape, bool)
+    live = share[:, 1] > share[:, 0]
+    each = jax.vmap(arc, (None, None, None, 0, 0, 0, 0, 0, 0))
+    return Arcs(share, each(table, seen, duration, share, s, w, piece, row, live), piece, row, held, live)
+
+
+def _to_break(table, seen, duration, how, at: _Parts):
+    """Steps from where an interval has come to its end or the end of the piece, whichever is first.
+
+    Returns the shares and states of the steps' ends, and whether the piece ended.
+    """
+    last = at.piece >= table.count - 1
+    goal = jnp.where(last, jnp.inf, table.breaks[at.piece + 1])
+    row = jnp.zeros((), int)
+
+    def advance(share, y, length, model):
+        def once(state, _):
+            share, y = state
+            y = single_step(*model, how, at.piece, row, share, y, length / STEPS)
+            share = share + length / STEPS
+            return (share, y), (share, y)
+
+        _, (when, place) = jax.lax.scan(once, (share, y), None, length=STEPS)
+        return jnp.concatenate([share[None], when]), jnp.concatenate([y[None], place])
+
+    model = (table, seen, duration)
+    frozen = stop_gradient((at.share, at.y)), stop_gradient(model)
+    whole = 1 - frozen[0][0]
+
+    def narrow(bracket):
+        """Newton on the part's length, bisecting where it would leave the bracket."""
+        low, high, length, _, count = bracket
+        _, place = advance(*frozen[0], length, frozen[1])
+        miss = place[-1, 0] - goal
+        low, high = jnp.where(miss < 0, length, low), jnp.where(miss < 0, high, length)
+        guess = length - miss / jnp.where(place[-1, 1] == 0, 1.0, place[-1, 1])
+        guess = jnp.where((guess >= low) & (guess <= high), guess, (low + high) / 2)
+        through = (count == 0) & ~(miss > 0)
+        near = jnp.abs(guess - length) <= LANDED * whole
+        return low, high, jnp.where(through, whole, guess), through | near, count + 1
+
+    start = (0 * whole, whole, whole, ~(whole > 0), 0)
+    _, _, length, settled, _ = jax.lax.while_loop(lambda b: ~b[3] & (b[4] < LANDINGS), narrow, start)
+    onward = length < whole
+    when, place = advance(at.share, at.y, jnp.where(onward, length, 1 - at.share), model)
+
+    def rate(share, y):
+        return jnp.stack([y[1], acceleration(*model, at.piece, row, share, y[0], y[1])])
+
+    # The cut lies where the end is exactly the goal: a shift of rounding size that carries the cut's derivatives.
+    pace = jnp.where(onward, stop_gradient(place[-1, 1]), 1.0)
+    late = jnp.where(onward, (jnp.where(onward, goal, 0.0) - place[-1, 0]) / pace, 0.0)
+    shift = late * jnp.linspace(0.0, 1.0, STEPS + 1)
+    place = place + stop_gradient(jax.vmap(rate)(when, place)) * shift[:, None]
+    return when + shift, jnp.where(settled, place, jnp.nan), onward
