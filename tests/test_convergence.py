@@ -1,0 +1,71 @@
+"""The order of convergence is the method's, across torque knots and a slip reversal."""
+
+from functools import cache
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.motion import Integration, move
+from wholearm_jax.reduction import blank
+from wholearm_jax.schedule import padded, window
+from wholearm_jax.status import Status
+from wholearm_jax.wire import Resolution
+
+LOOSE = 1e6  # a tolerance that accepts every step: steps are what lies between knots
+KNOTS, TORQUE = np.linspace(0.0, 1.0, 5), np.array([[0.9, -0.2], [0.1, 0.5], [0.8, 0.3], [0.2, 0.9], [1.0, 0.1]])
+
+
+@cache
+def table():
+    """A wire of length 1 with two smooth pieces; where they meet, at 0.6, the acceleration jumps as friction makes it.
+
+    Each piece is one polynomial, so that nothing but steps, knots and the meeting can spoil the order.
+    """
+    powers = np.arange(8)[:, None]
+    uneven = np.sin(1.0 + 2.0 * powers + 3.0 * np.arange(5)) * 0.8**powers
+    pieces = np.stack([uneven, -uneven])
+    pieces[0, 0] += [5.0, -0.6, -0.4, 1.5, -0.8]
+    pieces[1, 0] += [-2.0, 0.5, 0.3, 0.4, -0.2]
+    empty = blank(Resolution(pieces=2, panels=2, nodes=8))
+    given = ([0.0, 0.6, 1.0], 2, [0, 1], [1, 1], pieces)
+    return eqx.tree_at(
+        lambda t: (t.breaks, t.count, t.first, t.panels, t.acceleration), empty, tuple(map(jnp.asarray, given))
+    )
+
+
+@cache
+def program(solver):
+    """A simulation of the phase in given steps, compiled for schedules of one padded length."""
+    how = Integration(solver=solver, tolerance=LOOSE, max_steps=320, stages=3)
+    wire, start, duration = table(), jnp.zeros(()), jnp.ones(())
+    return jax.jit(lambda schedule: move(wire, window(schedule, start, duration), duration, how=how))
+
+
+def history(solver, parts):
+    """`(s, w)` at every 32nd of the phase, then when the wire's end is reached and at what speed; `parts` equal steps
+    in each interval of the torque."""
+    times = np.linspace(0.0, 1.0, 4 * parts + 1)
+    values = np.stack([np.interp(times, KNOTS, column) for column in TORQUE.T], axis=1)
+    found = program(solver)(padded(wa.torque(times, values), 320))
+    count = int(found.count)
+    assert int(found.status) == Status.LEFT_FORMATION
+    assert set(np.asarray(found.piece)[:count].tolist()) == {0, 1}
+    share, s, w = (np.asarray(a)[: count + 1] for a in (found.share, found.s, found.w))
+    common = np.abs(32 * share - np.round(32 * share)) < 1e-9
+    return np.append(np.stack([s, w], axis=1)[common], [[share[-1], w[-1]]], axis=0)
+
+
+@pytest.mark.parametrize(
+    ("solver", "order", "parts"), [(dfx.Bosh3(), 3, (24, 64)), (dfx.Tsit5(), 5, (24, 64)), (dfx.Dopri8(), 8, (8, 24))]
+)
+def test_order_across_knots_and_a_slip_reversal(solver, order, parts):
+    exact = history(dfx.Dopri8(), 72)
+    coarse, fine = (np.abs(history(solver, n) - exact).max() for n in parts)
+    observed = np.log(coarse / fine) / np.log(parts[1] / parts[0])
+    print(f"{type(solver).__name__}: errors {coarse:.1e}, {fine:.1e}, observed order {observed:.2f}")
+    assert observed > order - 0.5
