@@ -15,7 +15,7 @@ A step follows the curve on which accelerations and squeezes at the knots change
 are nearly linear. Source of the interior point: J. Nocedal and S. J. Wright, Numerical Optimization, 2006, chapter 19.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -326,7 +326,7 @@ class Descent(NamedTuple):
     """
 
     p: Variables
-    state: optax.OptState
+    state: Any  # the optimiser's, with `temperature` and `steps`
     before: Variables
     way: Variables
     share: Float[Array, ""]

@@ -50,11 +50,11 @@ class Arcs(eqx.Module):
 def arcs(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion) -> Arcs:
     """The steps of a motion as arcs."""
     live = jnp.arange(motion.held.shape[0]) < motion.count
-    ends = [jnp.stack([a[:-1], a[1:]], axis=1) for a in (motion.share, motion.s)]
+    share, s = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (motion.share, motion.s))
     w = jnp.stack([motion.entry_w, motion.w[1:]], axis=1)
     each = jax.vmap(arc, (None, None, None, 0, 0, 0, 0, 0, 0))
-    quintic = each(table, seen, duration, *ends, w, motion.piece, motion.row, live & ~motion.held)
-    return Arcs(ends[0], quintic, motion.piece, motion.row, motion.held, live)
+    quintic = each(table, seen, duration, share, s, w, motion.piece, motion.row, live & ~motion.held)
+    return Arcs(share, quintic, motion.piece, motion.row, motion.held, live)
 
 
 def arc(table: Table, seen: Window, duration, share, s, w, piece, row, moving) -> Float[Array, "6"]:

@@ -151,9 +151,11 @@ def _to_break(table, seen, duration, how, at: _Parts):
     row = jnp.zeros((), int)
 
     def advance(share, y, length, model):
+        table, seen, duration = model
+
         def once(state, _):
             share, y = state
-            y = single_step(*model, how, at.piece, row, share, y, length / STEPS)
+            y = single_step(table, seen, duration, how, at.piece, row, share, y, length / STEPS)
             share = share + length / STEPS
             return (share, y), (share, y)
 
@@ -182,7 +184,7 @@ def _to_break(table, seen, duration, how, at: _Parts):
     when, place = advance(at.share, at.y, jnp.where(onward, length, 1 - at.share), model)
 
     def rate(share, y):
-        return jnp.stack([y[1], acceleration(*model, at.piece, row, share, y[0], y[1])])
+        return jnp.stack([y[1], acceleration(table, seen, duration, at.piece, row, share, y[0], y[1])])
 
     # The cut lies where the end is exactly the goal: a shift of rounding size that carries the cut's derivatives.
     pace = jnp.where(onward, stop_gradient(place[-1, 1]), 1.0)
