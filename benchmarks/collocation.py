@@ -87,8 +87,8 @@ class Collocated:
     `course.least` [N] is the least force at the collocation points, `ipopt` its status. `margin` [N] and `verdict` are
     those of the honest simulation of `torque` (knots x 2, N m); `missed` is the distance to the wire's end that it
     leaves and `speed` the speed, in wire lengths and in these a duration. It took `solves` solves, `iterations` in all,
-    in `solve` seconds (the best of them alone in `best_solve`) after `build` seconds of building. Of the `guesses` tried
-    one after the other only `spent` counts all, in seconds.
+    in `solve` seconds (the best of them alone in `best_solve`) after `build` seconds of building. Of the `guesses`
+    tried one after the other only `spent` counts all, in seconds.
     """
 
     torque: np.ndarray
