@@ -91,7 +91,8 @@ class Heading(eqx.Module):
 class Phase(eqx.Module):
     """One contact formation held for a while.
 
-    `arrive` is `"rest"` (the object must be at rest at the end) or `"moving"` (any speed will do).
+    `arrive` is `"rest"` (the object must be at rest at the end), `"moving"` (the next phase takes over at speed, by an
+    inelastic impact) or `"caught"` (any speed will do, and is lost before the next phase).
     """
 
     name: str = eqx.field(static=True)
