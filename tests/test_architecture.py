@@ -12,6 +12,7 @@ PACKAGE = Path(wa.__file__).parent
 ORDER = (
     *("status", "scene", "contacts", "system", "newton", "wire", "reduction", "schedule", "motion", "forces"),
     *("verdict", "plan", "squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
+    *("free_bodies", "execution", "perturbation"),
     *("writing", "scene_file", "result_file", "drawing", "__init__", "command"),
 )
 
@@ -34,6 +35,15 @@ def test_matplotlib_stays_in_the_drawing_module_and_the_command_line():
     for path in PACKAGE.glob("*.py"):
         if path.stem not in ("drawing", "command"):
             assert "matplotlib" not in path.read_text(), path.stem
+
+
+def test_mujoco_stays_in_the_modules_that_execute():
+    executing = {"free_bodies", "execution", "perturbation"}
+    for path in PACKAGE.glob("*.py"):
+        tree = ast.parse(path.read_text())
+        top = {name for node in tree.body if isinstance(node, ast.ImportFrom) for name in [(node.module or "")]}
+        assert not any(name.rpartition(".")[2] in executing for name in top) or path.stem in executing, path.stem
+        assert "import mujoco" not in path.read_text() or path.stem in executing, path.stem
 
 
 def test_the_public_interface_is_small():

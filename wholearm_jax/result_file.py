@@ -1,12 +1,14 @@
 """Result files: torque schedules and trajectories as CSV, summaries as JSON."""
 
+from __future__ import annotations
+
 import csv
 import io
 import json
 import math
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +17,10 @@ from wholearm_jax.scene import COORDINATES
 from wholearm_jax.scene_file import CONSTRAINTS, SceneError, to_dict
 from wholearm_jax.schedule import Torque, torque
 from wholearm_jax.writing import write_whole
+
+if TYPE_CHECKING:  # running them needs MuJoCo, writing does not
+    from wholearm_jax.execution import Execution
+    from wholearm_jax.perturbation import Robustness
 
 TORQUE_COLUMNS = ("t", "tau1", "tau2")
 _CONTACTS = range(1, CONSTRAINTS + 1)
@@ -102,6 +108,44 @@ def summary(result: Result, *, bounds: tuple[float, ...] | None = None, **more: 
     head = {"status": result.status.label, "margin": result.margin, "message": result.message}
     again = {"scene": to_dict(result.scene), "version": version("wholearm_jax")}
     return _plain(head) | {"phases": phases} | _plain(more) | again
+
+
+def execution_summary(execution: Execution, robustness: Robustness | None = None, **more: Any) -> dict[str, Any]:
+    """What became of an execution, and of its perturbed copies, as the file `execution.json` holds it."""
+    head = {"status": execution.ending.value, "message": execution.message}
+    errors = {"position_error": execution.position_error, "angle_error": execution.angle_error}
+    within = {"tolerance": execution.tolerance._asdict(), "open_at_end": list(execution.open_at_end)}
+    events = [event._asdict() for event in execution.events]
+    prediction = {"status": execution.prediction.status.label, "margin": execution.prediction.margin}
+    row = _plain(head | errors) | within | {"events": events, "prediction": _plain(prediction)}
+    if robustness is not None:
+        low, high = robustness.interval
+        row["perturbed"] = {
+            "amounts": robustness.amounts._asdict(),
+            "seed": robustness.seed,
+            "executions": len(robustness.runs),
+            "successes": robustness.successes,
+            "interval_95": [low, high],
+            "runs": [_perturbed_row(run) for run in robustness.runs],
+        }
+    return row | {"timestep": execution.timestep} | _plain(more) | {"scene": to_dict(execution.prediction.scene)}
+
+
+def _perturbed_row(run) -> dict[str, Any]:
+    drawn = {"friction": run.friction.tolist(), "mass": run.mass}
+    end = [value if math.isfinite(value) else None for value in run.end.tolist()]
+    errors = {"position_error": run.position_error, "angle_error": run.angle_error}
+    return drawn | {"status": run.ending.value} | _plain(errors) | {"end": end}
+
+
+def write_execution(execution: Execution, path: str | Path, samples: int = 201) -> None:
+    """Write an execution at about `samples` times a phase: `t`, `z`, its rates, and `c_n` of every planned contact."""
+    course, planned = execution.course, execution.planned
+    every = max(1, (len(course.time) - 1) // (samples * len(execution.prediction.phases)))
+    columns = [execution.names.index(name) for name in planned]
+    table = np.column_stack([course.time, course.z, course.z_dot, course.cn[:, columns]])[::every]
+    header = ("t", *COORDINATES, *(f"{c}_dot" for c in COORDINATES), *(f"cn {name}" for name in planned))
+    write_whole(path, _csv(header, table.tolist()))
 
 
 def write_summary(content: dict[str, Any], path: str | Path) -> None:

@@ -1,0 +1,285 @@
+"""Executions on free bodies against the prediction, closed forms and balances that assume no formation."""
+
+import json
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib
+import mujoco
+import numpy as np
+import pytest
+from matplotlib.path import Path as Outline
+from scipy.stats import binomtest
+
+import wholearm_jax as wa
+from wholearm_jax import command
+from wholearm_jax.contacts import contacts, frames
+from wholearm_jax.drawing import animate, draw_execution, draw_execution_strip
+from wholearm_jax.execution import Ending, Tolerance, clock, drive, execute, start_of
+from wholearm_jax.free_bodies import _wedges, free_bodies
+from wholearm_jax.perturbation import Amounts, perturb, start_near, wilson
+from wholearm_jax.scene import body, formation
+
+DATA = Path(__file__).parent / "data"
+NAMES = ("heptagon", "hexagon")
+
+
+@pytest.fixture(scope="module")
+def predictions():
+    """Both plans under torques that `wholearm optimise` found for 1 s a phase."""
+    return {name: wa.simulate(wa.load(name), wa.read_torque(DATA / f"{name}_torque.csv")) for name in NAMES}
+
+
+@pytest.fixture(scope="module")
+def executions(predictions):
+    return {name: execute(prediction, timestep=2e-4) for name, prediction in predictions.items()}
+
+
+# --- the model: geometry and mechanics --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_distances_are_the_c_functions(name, predictions):
+    """MuJoCo's distance of each pair equals its gap where one faces the other, to the rounding of its 32-bit meshes."""
+    scene, rng = wa.load(name), np.random.default_rng(0)
+    bodies = free_bodies(scene, 2e-4)
+    data = mujoco.MjData(bodies.model)
+    several = contacts(body(scene.object), scene.hand, formation(bodies.names))
+    checked = set()
+    for _ in range(40):
+        data.qpos[:] = start_of(predictions[name]) + rng.uniform(-1, 1, 5) * [0.04, 0.04, 3.0, 0.5, 0.5]
+        mujoco.mj_kinematics(bodies.model, data)
+        at = frames(several, jnp.asarray(data.qpos))
+        inside = np.asarray((at.gap > 0) & (at.along > several.lower) & (at.along < several.upper))
+        for row in np.flatnonzero(inside):
+            first, second = np.argwhere(bodies.pair == row)[0]
+            distance = mujoco.mj_geomDistance(bodies.model, data, first, second, 1.0, None)
+            assert distance == pytest.approx(float(at.gap[row]), abs=5e-9), bodies.names[row]
+            checked.add(row)
+    assert len(checked) == len(bodies.names)
+
+
+def test_wedges_lie_inside_a_concave_object_and_apart():
+    corners = np.array([[0, 0], [4, 0], [4, 3], [2, 0.5], [1.8, 3], [0, 3]], float)
+    wedges = [Outline(w) for w in _wedges(corners, 1e-5)]
+    points = np.random.default_rng(0).uniform([-1, -1], [5, 4], (20_000, 2))
+    covered = np.stack([w.contains_points(points) for w in wedges])
+    assert covered.any(1).all()
+    assert covered.sum(0).max() == 1
+    assert Outline(corners).contains_points(points)[covered.any(0)].all()
+
+
+def test_free_fall_and_free_fingers(predictions):
+    """Away from everything the object falls by g t^2 / 2 and a finger obeys J theta'' = tau - B theta' - D."""
+    scene, step, count = predictions["heptagon"].scene, 1e-4, 1000
+    start, torque = np.array([0.0, 1.0, 0.3, 1.0, 2.0]), np.array([0.2, -0.3])
+    course, sound = drive(free_bodies(scene, step), scene, start, np.tile(torque, (count, 1)), step)
+    assert sound
+    t = count * step
+    np.testing.assert_allclose(course.z[-1, :3], [0, 1 - 9.81 * t * (t + step) / 2, 0.3], rtol=1e-12, atol=1e-12)
+    hand = scene.hand
+    rate, drive_ = np.asarray(hand.viscous / hand.inertia), torque - np.sign(torque) * np.asarray(hand.dry)
+    turned = drive_ / np.asarray(hand.viscous) * (t - (1 - np.exp(-rate * t)) / rate)
+    np.testing.assert_allclose(course.z[-1, 3:] - start[3:], turned, rtol=3e-3)
+    assert not course.cn.any()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_contact_forces_and_weight_change_the_momentum(name, executions):
+    """Newton's second law and its moment, step by step, from the traces of all contacts."""
+    course, scene = executions[name].course, executions[name].prediction.scene
+    solid = body(scene.object)
+    several = contacts(solid, scene.hand, formation(executions[name].names))
+    at = jax.vmap(frames, (None, 0))(several, course.z)
+    n = np.asarray(at.normal)
+    force = course.cn[..., None] * n + course.ct[..., None] * np.stack([n[..., 1], -n[..., 0]], axis=-1)
+    arm = np.asarray(at.from_object)
+    moment = (arm[..., 0] * force[..., 1] - arm[..., 1] * force[..., 0]).sum(1)
+    total = force.sum(1) + float(solid.mass) * np.asarray(scene.gravity)
+    gained = np.diff(course.z_dot, axis=0) / executions[name].timestep
+    np.testing.assert_allclose(float(solid.mass) * gained[:, :2], total[:-1], atol=1e-6)
+    # The lever arm of a dot and the depth of a contact leave a little of the moment.
+    np.testing.assert_allclose(float(solid.inertia) * gained[:, 2], moment[:-1], atol=2e-5)
+
+
+# --- against the prediction ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_ends_where_predicted(name, executions):
+    done = executions[name]
+    assert done.ending is Ending.OK
+    assert done.timestep == pytest.approx(2e-4, rel=1e-12)
+    assert done.position_error < 1e-4
+    assert abs(done.angle_error) < 1e-3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_forces_are_those_predicted(name, executions):
+    """In the middle half of each phase: each contact's mean force to 1 %, its friction likewise."""
+    done = executions[name]
+    for phase in done.prediction.phases:
+        middle = np.abs(done.expected.time - phase.start - phase.duration / 2) < phase.duration / 4
+        for contact in phase.contacts:
+            row = done.names.index(contact)
+            predicted = done.expected.cn[middle, row].mean()
+            assert done.force(contact)[middle].mean() == pytest.approx(predicted, rel=0.01), contact
+            tangential = np.interp(done.expected.time, done.course.time, done.course.ct[:, row])[middle].mean()
+            assert tangential == pytest.approx(done.expected.ct[middle, row].mean(), abs=0.01 * predicted), contact
+
+
+@pytest.mark.parametrize(("name", "new"), [("heptagon", "palm:v0"), ("hexagon", "palm:v1")])
+def test_contacts_change_when_predicted(name, new, executions):
+    events = {(e.contact, e.made): e for e in executions[name].events}
+    assert set(events) == {("finger2:v4", True), ("palm:v5", False), (new, True)}
+    for event in events.values():
+        # Gaps of a phase's end close slowly, so that a deviation of a few micrometres shifts the time.
+        assert event.executed == pytest.approx(event.predicted, abs=0.03 if event.contact == "finger2:v4" else 0.005)
+
+
+def test_error_shrinks_with_the_time_step(predictions, executions):
+    """Contacts harden with the time step: the first phase's worst deviation is of first order."""
+    fine = execute(predictions["heptagon"], timestep=1e-4)
+
+    def worst(done):
+        row = done.expected.time <= 1.0
+        x = np.interp(done.expected.time, done.course.time, done.course.z[:, 0])
+        return np.abs(x - done.expected.z[:, 0])[row].max()
+
+    assert worst(fine) < 0.65 * worst(executions["heptagon"])
+
+
+def test_a_plan_predicted_to_fail_fails(predictions):
+    """Half the torque does not move the object."""
+    torque = predictions["heptagon"].torque
+    weak = wa.simulate(predictions["heptagon"].scene, eqx.tree_at(lambda t: t.values, torque, 0.1 * torque.values))
+    assert weak.status.label != "ok"
+    assert execute(weak, timestep=5e-4).ending is not Ending.OK
+
+
+# --- perturbed executions --------------------------------------------------------------------------------------------
+
+
+def test_perturbed_executions_repeat_with_the_seed(predictions):
+    few = {"timestep": 5e-4, "threads": 2}
+    first, again, other = (
+        perturb(predictions["hexagon"], 3, Amounts(0.1, 0.05, 5e-4, 5e-4), seed=seed, **few) for seed in (1, 1, 2)
+    )
+    assert first.message == again.message
+    for one, two, three in zip(first.runs, again.runs, other.runs, strict=True):
+        np.testing.assert_array_equal(one.end, two.end)
+        assert np.abs(one.end - three.end).max() > 1e-6
+        assert np.all(np.abs(one.friction - 1) <= 0.1)
+        assert abs(one.mass - 1) <= 0.05
+    assert len({run.mass for run in first.runs}) == 3
+
+
+def test_unperturbed_copies_end_as_the_execution_does(predictions):
+    done = execute(predictions["heptagon"], timestep=5e-4)
+    copies = perturb(predictions["heptagon"], 2, Amounts(), timestep=5e-4)
+    for run in copies.runs:
+        np.testing.assert_allclose(run.end, done.course.z[-1], atol=1e-6)
+
+
+def test_small_changes_of_mass_do_no_harm(predictions):
+    many = perturb(predictions["heptagon"], 6, Amounts(mass=0.02), tolerance=Tolerance(1e-3, 0.02))
+    assert many.successes == 6
+    assert many.interval == pytest.approx((0.6097, 1.0), abs=1e-4)
+
+
+def test_a_perturbed_start_touches(predictions):
+    scene = predictions["heptagon"].scene
+    shift = np.array([4e-4, -3e-4, 2e-4])
+    z = start_near(scene, start_of(predictions["heptagon"]), shift)
+    several = contacts(body(scene.object), scene.hand, scene.phases[0].formation)
+    assert np.abs(frames(several, z).gap).max() < 1e-15
+    moved = z - start_of(predictions["heptagon"])
+    assert 1e-5 < np.abs(moved[:2]).max() < 1e-3
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(0, 10), (8, 10), (10, 10), (187, 200)])
+def test_wilson_interval(successes, trials):
+    expected = binomtest(successes, trials).proportion_ci(method="wilson")
+    assert wilson(successes, trials) == pytest.approx((expected.low, expected.high), abs=1e-6)
+
+
+def test_clock_divides_the_plan():
+    begins, step = clock(wa.load("heptagon"), 3e-4)
+    assert len(begins) * step == pytest.approx(2.0, rel=1e-14)
+    assert step == pytest.approx(3e-4, rel=1e-3)
+
+
+# --- figures and the command line ------------------------------------------------------------------------------------
+
+
+def test_figures(executions, tmp_path):
+    matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
+    done = executions["heptagon"]
+    figure = draw_execution(done)
+    labels = [text.get_text() for text in figure.axes[2].get_yticklabels()]
+    assert set(labels) >= set(done.planned)
+    draw_execution_strip(done, 4).savefig(tmp_path / "strip.png")
+    animate(done, 2).save(tmp_path / "motion.gif", writer="pillow")
+    assert (tmp_path / "motion.gif").stat().st_size > 5_000
+    plt.close("all")
+
+
+@pytest.fixture
+def wholearm(monkeypatch, capsys):
+    """Run the program in this process: arguments -> (exit status, standard output, standard error)."""
+    monkeypatch.setenv("JAX_ENABLE_COMPILATION_CACHE", "true")
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["wholearm", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            command.main()
+        printed = capsys.readouterr()
+        return caught.value.code or 0, printed.out, printed.err
+
+    return run
+
+
+TORQUE = ("--torque", DATA / "heptagon_torque.csv")
+
+
+def test_command(wholearm, tmp_path):
+    code, out, err = wholearm("execute", "heptagon", *TORQUE, "--timestep", 5e-4, "--perturb", 2, "--out", tmp_path)
+    assert (code, err) == (0, "")
+    assert "palm:v5 opened: 1.0050 s predicted" in out
+    assert "of 2 perturbed executions succeed" in out
+    assert out.splitlines()[-1].startswith("executed: ok, ")
+    content = json.loads((tmp_path / "execution.json").read_text())
+    assert content["status"] == "ok"
+    assert content["perturbed"]["executions"] == 2
+    assert {"execution.csv", "execution.png", "execution.svg", "model.xml"} <= {p.name for p in tmp_path.iterdir()}
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    assert (model.nq, model.nu, model.opt.timestep) == (5, 2, pytest.approx(5e-4))
+
+
+@pytest.mark.parametrize(
+    ("more", "cause"),
+    [
+        (("--friction", "much"), "--friction much: write a share"),
+        (("--mass", "150%"), "--mass 150%: write a share"),
+        (("--video",), "--video: needs a folder"),
+    ],
+)
+def test_bad_options(more, cause, wholearm):
+    code, out, err = wholearm("execute", "heptagon", *TORQUE, *more)
+    assert (code, out) == (2, "")
+    assert cause in err
+    assert err.count("\n") == 1
+
+
+def test_missing_extra_is_one_clear_line(wholearm, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    for name in ("free_bodies", "execution", "perturbation"):
+        monkeypatch.delitem(sys.modules, f"wholearm_jax.{name}", raising=False)
+    code, out, err = wholearm("execute", "heptagon", *TORQUE)
+    assert (code, out) == (2, "")
+    assert err == "wholearm: execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'\n"

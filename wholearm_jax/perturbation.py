@@ -1,0 +1,171 @@
+r"""Perturb: a plan executed many times with friction, mass, geometry and start a little off, and how often it succeeds.
+
+Every draw is uniform within plus or minus its amount: a factor on each link's friction coefficient, one on the mass
+(and with it the inertia), a shift of each coordinate of each vertex, and a shift of the object's start in x, y and, by
+that over its radius, phi. The object that is then laid in the hand touches as the first formation says: the start is
+the nearest configuration at which the perturbed object's gaps are 0 (least-norm Newton steps in object units). The
+torques stay those of the unperturbed plan, and so does the end that counts as success.
+"""
+
+import os
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+from mujoco import rollout
+
+from wholearm_jax.contacts import gaps, normal_rows
+from wholearm_jax.execution import Ending, Tolerance, clock, judge, motor_torques, require_wires, start_of, target_of
+from wholearm_jax.free_bodies import Softness, free_bodies
+from wholearm_jax.plan import Result
+from wholearm_jax.scene import Formation, Scene, body
+from wholearm_jax.system import system
+
+CHUNK = 64  # executions that are kept in memory at once
+
+
+class Amounts(NamedTuple):
+    """Half widths of the uniform draws: `friction` and `mass` relative, `geometry` and `start` in metres."""
+
+    friction: float = 0.0
+    mass: float = 0.0
+    geometry: float = 0.0
+    start: float = 0.0
+
+
+@dataclass(frozen=True)
+class Perturbed:
+    """One execution: factors and shifts drawn, where the object ended, and what that counts as."""
+
+    friction: Float[np.ndarray, "3"]
+    mass: float
+    end: Float[np.ndarray, "5"]
+    position_error: float
+    angle_error: float
+    ending: Ending
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """Many perturbed executions; `interval` is the success rate's 95 % confidence interval (Wilson's)."""
+
+    amounts: Amounts
+    seed: int
+    tolerance: Tolerance
+    runs: tuple[Perturbed, ...]
+
+    @property
+    def successes(self) -> int:
+        return sum(run.ending is Ending.OK for run in self.runs)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        return wilson(self.successes, len(self.runs))
+
+    @property
+    def message(self) -> str:
+        """The success rate in one line."""
+        low, high = self.interval
+        share = 100 * self.successes / len(self.runs)
+        span = f"95 % confidence interval {100 * low:.1f} to {100 * high:.1f} %"
+        return f"{self.successes} of {len(self.runs)} perturbed executions succeed: {share:.1f} %, {span}"
+
+
+def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's score interval for a proportion; `z` is the normal quantile (default: 95 %)."""
+    rate, weight = successes / trials, z**2 / trials
+    middle = (rate + weight / 2) / (1 + weight)
+    half = z / (1 + weight) * np.sqrt(rate * (1 - rate) / trials + weight / (4 * trials))
+    return max(0.0, float(middle - half)), min(1.0, float(middle + half))
+
+
+def perturb(
+    prediction: Result,
+    count: int,
+    amounts: Amounts,
+    *,
+    seed: int = 0,
+    timestep: float = 2e-4,
+    softness: Softness = Softness(),
+    tolerance: Tolerance = Tolerance(),
+    threads: int | None = None,
+) -> Robustness:
+    """Execute `count` perturbed copies of a plan on `threads` threads (default: every processor)."""
+    require_wires(prediction)
+    rng = np.random.default_rng(seed)
+    scenes = [_perturbed(prediction.scene, amounts, rng) for _ in range(count)]
+    shifts = rng.uniform(-1, 1, (count, 3)) * amounts.start
+    begins, step = clock(prediction.scene, timestep)
+    torques = motor_torques(prediction.torque, begins)
+    nominal, target = start_of(prediction), target_of(prediction)
+    runs = []
+    for first in range(0, count, CHUNK):
+        few = scenes[first : first + CHUNK]
+        starts = [start_near(s, nominal, shift) for s, shift in zip(few, shifts[first:], strict=False)]
+        models = [free_bodies(s, step, softness).model for s in few]
+        ends = _ends(models, np.stack(starts), torques, threads)
+        for s, end in zip(few, ends, strict=True):
+            ending, _ = judge(s, end, target, tolerance)
+            runs.append(_summary(prediction.scene, s, end, target, ending))
+    return Robustness(amounts, seed, tolerance, tuple(runs))
+
+
+def _perturbed(scene: Scene, amounts: Amounts, rng: np.random.Generator) -> Scene:
+    """The scene with another object. Everything is drawn whatever the amounts, so that each keeps its own sequence."""
+    shape = scene.object
+    friction = 1 + amounts.friction * rng.uniform(-1, 1, 3)
+    mass = 1 + amounts.mass * rng.uniform(-1, 1)
+    shift = amounts.geometry * rng.uniform(-1, 1, shape.vertices.shape)
+    shift[int(shape.count) :] = shift[int(shape.count) - 1]  # padding repeats the last vertex
+    changed = eqx.tree_at(
+        lambda s: (s.friction, s.mass, s.vertices),
+        shape,
+        (shape.friction * friction, shape.mass * mass, shape.vertices + shift),
+    )
+    if shape.inertia is not None:
+        changed = eqx.tree_at(lambda s: s.inertia, changed, shape.inertia * mass)
+    return eqx.tree_at(lambda s: s.object, scene, changed)
+
+
+def start_near(scene: Scene, z, shift) -> Float[np.ndarray, "5"]:
+    """The configuration next to `z`, its object displaced by `shift` [m], at which the first formation's gaps are 0."""
+    return np.asarray(_touch_down(scene.object, scene.hand, scene.gravity, scene.phases[0].formation, z, shift))
+
+
+@jax.jit
+def _touch_down(shape, hand, gravity, formation: Formation, z, shift) -> Float[Array, "5"]:
+    mechanics = system(body(shape), hand, gravity, formation)
+    displaced = z / mechanics.configuration_unit + jnp.zeros(5).at[:3].set(shift / mechanics.length)
+
+    def closer(_, z):
+        rows = normal_rows(mechanics.contacts, z)
+        return z - rows.T @ jnp.linalg.solve(rows @ rows.T, gaps(mechanics.contacts, z))
+
+    return jax.lax.fori_loop(0, 20, closer, displaced) * mechanics.configuration_unit
+
+
+def _ends(models, starts, torques, threads: int | None) -> Float[np.ndarray, "runs 5"]:
+    """Where each model ends, driven from rest at its start."""
+    state = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    places = np.zeros((len(models), mujoco.mj_stateSize(models[0], state)))
+    places[:, 1:6] = starts  # time, positions, velocities
+    data = [mujoco.MjData(models[0]) for _ in range(min(threads or os.cpu_count() or 1, len(models)))]
+    states, _ = rollout.rollout(models, data, places, torques[None])
+    return states[:, -1, 1:6]
+
+
+def _summary(scene: Scene, changed: Scene, end, target, ending: Ending) -> Perturbed:
+    off = end - target
+    return Perturbed(
+        friction=np.asarray(changed.object.friction / scene.object.friction),
+        mass=float(changed.object.mass / scene.object.mass),
+        end=end,
+        position_error=float(np.hypot(*off[:2])),
+        angle_error=float(off[2]),
+        ending=ending,
+    )
