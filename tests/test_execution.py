@@ -48,11 +48,11 @@ def test_distances_are_the_c_functions(name, predictions):
     bodies = free_bodies(scene, 2e-4)
     data = mujoco.MjData(bodies.model)
     several = contacts(body(scene.object), scene.hand, formation(bodies.names))
-    checked = set()
-    for _ in range(40):
+    locate, checked = jax.jit(frames), set()
+    for _ in range(150):
         data.qpos[:] = start_of(predictions[name]) + rng.uniform(-1, 1, 5) * [0.04, 0.04, 3.0, 0.5, 0.5]
         mujoco.mj_kinematics(bodies.model, data)
-        at = frames(several, jnp.asarray(data.qpos))
+        at = locate(several, jnp.asarray(data.qpos))
         inside = np.asarray((at.gap > 0) & (at.along > several.lower) & (at.along < several.upper))
         for row in np.flatnonzero(inside):
             first, second = np.argwhere(bodies.pair == row)[0]

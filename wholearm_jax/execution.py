@@ -7,6 +7,9 @@ opened is read off the gaps, by one rule for prediction and execution: it touche
 lies on its feature.
 """
 
+# MuJoCo's names come from a compiled module, which type checkers cannot see into.
+# pyright: reportAttributeAccessIssue=false
+
 import enum
 from dataclasses import dataclass
 from typing import NamedTuple

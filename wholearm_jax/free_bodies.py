@@ -21,6 +21,9 @@ critically damped, so that a steady load sags by `(1 - d) a_free t_c^2`. Frictio
 the link's coefficient; while it sticks, slip dies out at the rate `b_f`.
 """
 
+# MuJoCo's names come from a compiled module, which type checkers cannot see into.
+# pyright: reportAttributeAccessIssue=false
+
 from dataclasses import dataclass
 
 import jax

@@ -7,6 +7,9 @@ the nearest configuration at which the perturbed object's gaps are 0 (least-norm
 torques stay those of the unperturbed plan, and so does the end that counts as success.
 """
 
+# MuJoCo's names come from a compiled module, which type checkers cannot see into.
+# pyright: reportAttributeAccessIssue=false
+
 import os
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -156,7 +159,7 @@ def _ends(models, starts, torques, threads: int | None) -> Float[np.ndarray, "ru
     places[:, 1:6] = starts  # time, positions, velocities
     data = [mujoco.MjData(models[0]) for _ in range(min(threads or os.cpu_count() or 1, len(models)))]
     states, _ = rollout.rollout(models, data, places, torques[None])
-    return states[:, -1, 1:6]
+    return np.asarray(states)[:, -1, 1:6]
 
 
 def _summary(scene: Scene, changed: Scene, end, target, ending: Ending) -> Perturbed:
