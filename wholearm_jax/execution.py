@@ -179,7 +179,7 @@ def start_of(prediction: Result) -> Float[np.ndarray, "5"]:
 def target_of(prediction: Result) -> Float[np.ndarray, "5"]:
     """Where the plan ends: its last wire's end, or the predicted end where it need not stand still there."""
     last = prediction.phases[-1]
-    moving = prediction.scene.phases[-1].arrive == "moving" and prediction.status is Status.OK
+    moving = prediction.scene.phases[-1].arrive != "rest" and prediction.status is Status.OK
     end = trajectory(prediction, 2)[-1].z[-1] if moving else end_configuration(last.traced)
     return np.asarray(end)
 
