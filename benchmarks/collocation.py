@@ -47,6 +47,7 @@ BELLS = tuple((p, q) for p in (1, 2, 4, 8) for q in (1, 2, 4, 8))  # motions wit
 MINIMUM_JERK = (2, 2)
 MOVES, WIDELY = 12, 20  # intervals of reversals tried, and where none is to be missed
 SETTINGS = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "ipopt.max_iter": 1000, "ipopt.tol": 1e-8}
+QUICKER = {"ipopt.mu_strategy": "adaptive", "ipopt.max_iter": 300}  # mostly quicker, but once it did not end
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -138,27 +139,22 @@ def collocate(table: Table, duration: float, *, knots: int = KNOTS) -> Collocate
     return replace(best, guesses=len(tried), spent=sum(one.build + one.solve for one in tried))
 
 
-def best_known(table: Table, duration: float, coarse: Collocated) -> Collocated:
-    """The largest margin that collocation can find with the same knots, whatever it costs.
+def best_known(table: Table, duration: float, coarse: Collocated, *, enough: float = np.inf) -> Collocated:
+    """The largest margin that collocation finds with the same knots, whatever it costs, or one of `enough` newtons.
 
-    From a coarse solution: reversals are first tried in every interval. Then each interval is divided, into `FINE` or
-    more in all, and those of reversals searched widely, with IPOPT's two strategies for its barrier; from two bell
-    motions as well. Forces are then held at so many times that the simulated margin is close to the programme's.
+    Each interval between knots is divided, into `FINE` or more in all, so that forces are held at many times and the
+    simulated margin is close to the programme's. Reversals are searched widely, from the minimum-jerk motion, the one
+    that can be squeezed hardest and the coarse solution: the optima that they lead to differ.
     """
-    knots = len(coarse.torque)
-    phase = Phase(read(table), duration, knots, 1)
-    course = coarse.course
-    for k in range(len(phase.wire.pieces) - 1):
-        rows, splits = _passed(phase, course)
-        tries = [(*rows[:k], row, *rows[k + 1 :]) for row in range(phase.intervals)]
-        ordered = [one for one in tries if list(one) == sorted(one)]
-        found = max((_once(phase, course, one, splits, {}) for one in ordered), key=lambda one: one.rank)
-        course = found.course if found.course.least > course.least else course
-    fine = phase._replace(refine=-(-FINE // phase.intervals))
-    bells = [_course(table, fine, bell) for bell in (MINIMUM_JERK, _hardest(table, duration))]
-    starts = [(course, {}), (course, {"ipopt.mu_strategy": "adaptive"}), *((one, {}) for one in bells)]
-    each = [_collected(table, fine, _explored(fine, start, options)) for start, options in starts]
-    return max(each, key=lambda one: (one.succeeded, one.margin))
+    intervals = len(coarse.torque) - 1
+    phase = Phase(read(table), duration, intervals + 1, -(-FINE // intervals))
+    bells = (_course(table, phase, bell) for bell in (MINIMUM_JERK, _hardest(table, duration)))
+    found: list[Collocated] = []
+    for start in (*bells, coarse.course):
+        found.append(_collected(table, phase, _explored(phase, start, QUICKER)))
+        if found[-1].succeeded and found[-1].margin >= enough:
+            break
+    return max(found, key=lambda one: (one.succeeded, one.margin))
 
 
 # --- the wire as smooth functions -------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """Optimisers side by side: the package's descent, direct collocation with IPOPT, and the paper's search by 10 %.
 
-    python benchmarks/optimisation.py [--quick] [--knots N] [--reference {solve,reuse,none}]
+    python benchmarks/optimisation.py [--quick] [--knots N] [--references]
 
 The same plans for all: both bundled ones at 1.0, 0.3 and 0.15 s a phase, and a dozen on random polygons
 (`random_plans`) at 1.0 and 0.3 s; the search chooses its own durations. Every margin is that of the package's own
@@ -8,8 +8,9 @@ simulation of the torques found, and a plan fails unless that simulation's statu
 and `search` run twice and the second run counts, tracing included. Of the collocation only IPOPT's own time counts:
 for all solves from the guess that led to the result, and for the best of these solves alone; what building its
 programmes took stands beside it. The reference is the largest margin that
-collocation finds at any cost (`collocation.best_known`), with finer intervals and from several starts; `--reference
-reuse` takes it from the last results.
+collocation finds at any cost (`collocation.best_known`), with finer intervals and from several starts. References take
+long, but not each time: they are kept in `results/references.json` for as long as a phase's bound stays the same, and
+`--references` finds those that are missing and does nothing else.
 """
 
 import argparse
@@ -17,7 +18,7 @@ import inspect
 import json
 import statistics
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 import equinox as eqx
 import jax
@@ -86,27 +87,23 @@ class Case:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="bundled plans and four random ones, 1.0 s, no reference")
+    parser.add_argument("--quick", action="store_true", help="bundled plans and four random ones, 1.0 s; saves nothing")
     parser.add_argument("--knots", type=int, default=USUAL, help="torques a joint and phase, for both optimisers")
-    parser.add_argument("--reference", choices=("solve", "reuse", "none"), default="solve")
+    parser.add_argument("--references", action="store_true", help="only find the references that are missing")
     chosen = parser.parse_args()
-    name = "optimisation" if chosen.knots == USUAL else f"optimisation_{chosen.knots}_knots"
-    references = _stored(name) if chosen.reference == "reuse" else {}
+    if chosen.references:
+        return find_references(chosen.knots)
     cases = []
     for plan, scene, durations in _plans(chosen.quick):
         wa.search(scene)
         searched = wa.search(scene)
         for duration in durations:
-            case, found = _case(plan, _lasting(scene, duration), chosen.knots, searched)
-            if chosen.reference == "solve" and not chosen.quick:
-                case = _with_reference(case, found)
-            elif references:
-                case = _recalled(case, references)
-            cases.append(case)
-            _print(case)
+            cases.append(_case(plan, _lasting(scene, duration), chosen.knots, searched))
+            _print(cases[-1])
     summary = _summary(cases)
     print(json.dumps(summary, indent=1))
     if not chosen.quick:
+        name = "optimisation" if chosen.knots == USUAL else f"optimisation_{chosen.knots}_knots"
         rows = [asdict(case) for case in cases]
         measure.save(name, {"knots": chosen.knots, "summary": summary, "cases": rows})
         draw(cases, measure.RESULTS / f"{name}.svg")
@@ -138,14 +135,18 @@ def _optimised(scene: wa.Scene, knots: int):
     return found, time.perf_counter() - begun
 
 
-def _case(plan: str, scene: wa.Scene, knots: int, searched):
-    """Run both optimisers on one plan; also the tables and solutions from which `_with_reference` goes on."""
+def _case(plan: str, scene: wa.Scene, knots: int, searched) -> Case:
+    """Run both optimisers on one plan."""
     descended, taken = _optimised(scene, knots)
     duration = float(scene.phases[0].duration)
-    tables = [at.table for at in wa.trace(scene)]
-    collocated = [collocate(table, duration, knots=knots) for table in tables]
-    contenders = (descended.result.phases, descended.bounds, collocated, searched.result.phases)
-    case = Case(
+    collocated = [collocate(at.table, duration, knots=knots) for at in wa.trace(scene)]
+    stored = _references()
+    known = [
+        _recalled(stored, _key(plan, duration, phase.name, knots), float(top.value))
+        for phase, top in zip(scene.phases, descended.bounds, strict=True)
+    ]
+    contenders = (descended.result.phases, descended.bounds, collocated, searched.result.phases, known)
+    return Case(
         plan=plan,
         duration=duration,
         optimise_seconds=taken,
@@ -156,10 +157,9 @@ def _case(plan: str, scene: wa.Scene, knots: int, searched):
         simulations=searched.simulations,
         phases=tuple(_row(*each) for each in zip(*contenders, strict=True)),
     )
-    return case, list(zip(tables, collocated, strict=True))
 
 
-def _row(descended, bound, collocated: Collocated, searched) -> PhaseRow:
+def _row(descended, bound, collocated: Collocated, searched, reference: float | None) -> PhaseRow:
     return PhaseRow(
         phase=descended.name,
         bound=float(bound.value),
@@ -175,28 +175,47 @@ def _row(descended, bound, collocated: Collocated, searched) -> PhaseRow:
         guesses=collocated.guesses,
         search=searched.margin,
         search_status=searched.status.label,
+        reference=reference,
     )
 
 
-def _with_reference(case: Case, found: list) -> Case:
-    rows = []
-    for row, (table, collocated) in zip(case.phases, found, strict=True):
-        best = best_known(table, case.duration, collocated)
-        rows.append(replace(row, reference=best.margin if best.succeeded else None))
-    return replace(case, phases=tuple(rows))
+# --- references -------------------------------------------------------------------------------------------------------
+
+ENOUGH = 0.998  # share of the bound at which nothing better is looked for
+REFERENCES = measure.RESULTS / "references.json"
 
 
-def _stored(name: str) -> dict[tuple[str, float, str], float | None]:
-    """The references of the last results."""
-    cases = json.loads((measure.RESULTS / f"{name}.json").read_text())["cases"]
-    return {
-        (case["plan"], case["duration"], row["phase"]): row["reference"] for case in cases for row in case["phases"]
-    }
+def find_references(knots: int) -> None:
+    """Find and keep the references that are missing, one after the other."""
+    for plan, scene, durations in _plans(False):
+        traced = wa.trace(scene)
+        for duration in durations:
+            tops = wa.bounds(_lasting(scene, duration), traced=traced)
+            for phase, at, top in zip(scene.phases, traced, tops, strict=True):
+                key, bound, stored = _key(plan, duration, phase.name, knots), float(top.value), _references()
+                if _recalled(stored, key, bound) is not None:
+                    continue
+                coarse = collocate(at.table, duration, knots=knots)
+                found = best_known(at.table, duration, coarse, enough=ENOUGH * bound)
+                stored[key] = {"bound": bound, "margin": found.margin if found.succeeded else None}
+                REFERENCES.parent.mkdir(exist_ok=True)
+                REFERENCES.write_text(json.dumps(stored, indent=1) + "\n")
+                print(f"{key}: {found.margin:.4f} {found.verdict} of {bound:.4f}", flush=True)
 
 
-def _recalled(case: Case, references) -> Case:
-    rows = [replace(row, reference=references.get((case.plan, case.duration, row.phase))) for row in case.phases]
-    return replace(case, phases=tuple(rows))
+def _key(plan: str, duration: float, phase: str, knots: int) -> str:
+    return f"{plan}, {duration:g} s, {phase}, {knots} knots"
+
+
+def _references() -> dict[str, dict[str, float | None]]:
+    return json.loads(REFERENCES.read_text()) if REFERENCES.exists() else {}
+
+
+def _recalled(stored, key: str, bound: float) -> float | None:
+    """A reference [N], unless there is none or it belongs to another wire."""
+    one = stored.get(key)
+    same = one is not None and abs(one["bound"] - bound) <= 1e-6 * abs(bound)
+    return one["margin"] if same else None
 
 
 # --- what is reported -------------------------------------------------------------------------------------------------
