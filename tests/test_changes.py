@@ -31,7 +31,7 @@ def test_three_formations_without_a_stop(flown):
         assert after.start == pytest.approx(before.time, abs=1e-12), "the change is when the formation ends"
         assert float(jnp.abs(before.outcome.leaving).max()) > 1e-4, "moving"
         assert min(after.impulses) > 0
-    assert float(jnp.abs(result.phases[0].outcome.leaving).max()) > 1.0, "the first change at speed"
+    assert float(jnp.abs(result.phases[0].outcome.leaving).max()) > 0.5, "the first change at speed"
     for phase, top in zip(result.phases, flown.bounds, strict=True):
         assert 0 < phase.margin <= float(top.value) + 1e-9
 

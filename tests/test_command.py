@@ -9,7 +9,7 @@ import pytest
 import tomli_w
 
 from wholearm_jax import command
-from wholearm_jax.scene_file import load, to_dict
+from wholearm_jax.scene_file import bundled, load, to_dict
 
 
 @pytest.fixture
@@ -67,17 +67,17 @@ def assert_bad_input(answer, *parts):
 def test_scenes(wholearm):
     code, out, err = wholearm("scenes")
     assert code == 0
-    assert out.splitlines() == [
-        "heptagon: irregular heptagon; slide left, flip right",
-        "hexagon: hexagon; slide left, flip right",
-    ]
+    rows = out.splitlines()
+    assert "heptagon: irregular heptagon; slide left, flip right" in rows
+    assert "hexagon: hexagon; slide left, flip right" in rows
+    assert [row.partition(":")[0] for row in rows] == list(bundled())
     assert err == ""
 
 
 def test_help_lists_the_commands(wholearm):
     code, out, _ = wholearm("--help")
     assert code == 0
-    for name in ("optimise", "simulate", "search", "scenes"):
+    for name in ("optimise", "simulate", "search", "formations", "execute", "scenes"):
         assert f"  {name} " in out
 
 
