@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.forces import Arcs, arc, sampled_forces
+from wholearm_jax.forces import Arcs, arc, sampled_slacks
 from wholearm_jax.motion import Integration, acceleration, single_step
 from wholearm_jax.reduction import Table
 from wholearm_jax.schedule import Torque, Window
@@ -54,10 +54,10 @@ class Variables(eqx.Module):
 
 
 class Shot(NamedTuple):
-    """Intervals simulated: forces [N] at every sample, the sample's share of the phase (0: none), the speed at the
+    """Intervals simulated: forces' slacks [N] (`forces.slack`) at every sample, the sample's share of the phase (0: none), the speed at the
     interval's start and inside it in wire lengths a duration, and the state at its end as in `Variables`."""
 
-    forces: Float[Array, "*intervals samples contacts"]
+    forces: Float[Array, "*intervals samples slots"]
     weight: Float[Array, "*intervals samples"]
     pace: Float[Array, "*intervals steps"]
     end: Float[Array, "*intervals 2"]
@@ -119,7 +119,7 @@ def shoot(table: Table, how: Integration, intervals: int, q: Float[Array, "7"]) 
 
     done = jax.lax.while_loop(lambda at: (at.share < 1) & (at.count < PARTS), one_part, begin)
     steps = _arcs(table, seen, duration, done)
-    forces = sampled_forces(table, seen, duration, steps, SAMPLES).reshape(PARTS * STEPS * SAMPLES, -1)
+    forces = sampled_slacks(table, seen, duration, steps, SAMPLES).reshape(PARTS * STEPS * SAMPLES, -1)
     weight = jnp.repeat((done.when[:, -1] - done.when[:, 0]) / (STEPS * SAMPLES * intervals), STEPS * SAMPLES)
     y = jnp.where(done.share < 1, jnp.nan, done.y)
     return Shot(
