@@ -25,10 +25,10 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.forces import smooth_margin
+from wholearm_jax.forces import smooth_margin, spare
 from wholearm_jax.motion import Integration
 from wholearm_jax.reduction import Table
-from wholearm_jax.shooting import PARTS, SAMPLES, STEPS, Variables, local, shoot
+from wholearm_jax.shooting import PARTS, ROWS, SAMPLES, STEPS, Variables, local, shoot
 from wholearm_jax.squeeze import coefficients
 
 HOTTEST, COLDEST = 0.1, 1e-4  # temperatures, as shares of the bound
@@ -83,7 +83,7 @@ def rooms(q: Float[Array, "7"], later: Float[Array, ""], table: Table, limits: L
     ends = jnp.stack([log - jnp.log(limits.shortest), jnp.log(limits.longest) - log]) / jnp.where(free, span, 1.0)
     room = [(shot.forces / limits.unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, shot.pace, ends]
     one = jnp.full((), 1 / intervals)
-    sampled = jnp.repeat(shot.weight, shot.forces.shape[1])
+    sampled = (shot.weight[:, None] * ~spare(table)).ravel()
     climbs = jnp.tile(jnp.where(bounded, one / 4, 0.0), 2)
     paces = jnp.full(STEPS, one).at[0].multiply(later)
     weight = [sampled, jnp.full(8, one / 4), climbs, paces, jnp.full(2, jnp.where(free, one / 4, 0.0))]
@@ -105,7 +105,7 @@ def linearise(p: Variables, table: Table, limits: Limits, how: Integration) -> L
     across = across.at[each[:, None], np.repeat(columns, 2, axis=0)].add(rates.end.reshape(-1, columns.shape[1]))
     across = across.at[each, ends.ravel()].add(-1.0)
     still = _still(limits, knots)
-    bears = np.arange(at.room.shape[1]) < PARTS * STEPS * SAMPLES * table.force.shape[2]
+    bears = np.arange(at.room.shape[1]) < PARTS * STEPS * SAMPLES * ROWS
     return Linear(at, rates, at.end - p.state[1:], jnp.where(still, 0.0, across), jnp.asarray(bears * 1.0), still)
 
 
@@ -157,8 +157,8 @@ def interior_point() -> optax.GradientTransformationExtraArgs:
     """The primal-dual direction as an optax transformation; wants `linear=`, and makes its own gradient from it."""
 
     def init(params):
-        intervals, contacts = (params.shape[0] - 1) // 4 - 1, 4
-        shape = (intervals, PARTS * STEPS * SAMPLES * contacts + 8 + 4 + STEPS + 2)
+        intervals = (params.shape[0] - 1) // 4 - 1
+        shape = (intervals, PARTS * STEPS * SAMPLES * ROWS + 8 + 4 + STEPS + 2)
         start = jnp.full((), HOTTEST)
         return Duals(jnp.ones(shape), jnp.zeros(shape), jnp.full((), jnp.nan), start, jnp.zeros(2))
 

@@ -10,6 +10,7 @@ theorem), landings and knots included.
 """
 
 import math
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -22,6 +23,7 @@ from wholearm_jax.reduction import Table, horner, powers
 from wholearm_jax.schedule import Window, torque_in
 
 SAMPLES = 7  # places in a step at which forces are sampled before the minimum is refined
+MOST_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
 REFINED = 4  # lowest samples refined; a minimum is missed only if four others sample lower
 
 
@@ -105,18 +107,39 @@ def slack(table: Table, forces: Float[Array, "slots"]) -> Float[Array, "slots"]:
     return jnp.where(table.tangential, cone, forces)
 
 
-def slacks_on(table: Table, seen: Window, duration, arc: Arcs, xi) -> Float[Array, "slots"]:
-    """`slack` at `xi` of one arc."""
+def linear_slacks(table: Table, forces: Float[Array, "slots *terms"]) -> Float[Array, "rows *terms"]:
+    """Linear functions of the forces whose least is the least `slack`: both sides of each friction cone.
+
+    `forces` may be coefficients, by any linear terms. Four constraints have at most two tangential rows, and so there
+    are six of these; those not needed (`spare`) repeat the first.
+    """
+    column = (slice(None), *(None,) * (forces.ndim - 1))
+    normal = table.grip[column] * jnp.roll(forces, 1, axis=0)
+    one_side = jnp.where(table.tangential[column], normal - forces, forces)
+    (rolling,) = jnp.nonzero(table.tangential, size=MOST_ROLLING, fill_value=-1)
+    other = jnp.where((rolling >= 0)[column], (normal + forces)[rolling], forces[0])
+    return jnp.concatenate([one_side, other])
+
+
+def spare(table: Table) -> Bool[Array, "rows"]:
+    """Which of `linear_slacks` repeat another."""
+    slots = table.tangential.shape[0]
+    return jnp.arange(slots + MOST_ROLLING) >= slots + table.tangential.sum()
+
+
+def slacks_on(table: Table, seen: Window, duration, arc: Arcs, xi, kind=slack) -> Float[Array, "rows"]:
+    """`slack` (or `linear_slacks`) at `xi` of one arc."""
     share, s, w = on_arc(arc, xi)
-    return slack(table, force(table, seen, duration, arc.piece, arc.row, share, s, w))
+    return kind(table, force(table, seen, duration, arc.piece, arc.row, share, s, w))
 
 
 def sampled_slacks(
-    table: Table, seen: Window, duration, steps: Arcs, samples: int = SAMPLES
-) -> Float[Array, "steps samples slots"]:
-    """`slack` at evenly spaced places of every step, its two ends included; infinite where nothing moves."""
+    table: Table, seen: Window, duration, steps: Arcs, samples: int = SAMPLES, kind=slack
+) -> Float[Array, "steps samples rows"]:
+    """`slack` (or `linear_slacks`) at evenly spaced places of every step, its two ends included; infinite where nothing moves."""
     xi = jnp.linspace(0.0, 1.0, samples, dtype=steps.quintic.dtype)
-    at = jax.vmap(jax.vmap(slacks_on, (None, None, None, None, 0)), (None, None, None, 0, None))
+    on = partial(slacks_on, kind=kind)
+    at = jax.vmap(jax.vmap(on, (None, None, None, None, 0)), (None, None, None, 0, None))
     values = at(table, seen, duration, steps, xi)
     return jnp.where((steps.live & ~steps.held)[:, None, None], values, jnp.inf)
 

@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from wholearm_jax.forces import linear_slacks
 from wholearm_jax.reduction import Table, horner, powers
 
 SPEEDS = 12  # speed intervals of the bound
 FASTEST = 8.0  # it covers speeds up to this many wire lengths a duration
 PLACES = 64
-MOST_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
 
 
 class Hold(eqx.Module):
@@ -44,18 +44,6 @@ def coefficients(table: Table, s: Float[Array, ""]):
     piece = jnp.minimum((s >= inner).sum(), table.count - 1)
     panel, xi = powers(table, piece, s)
     return horner(table.acceleration[panel], xi), horner(table.force[panel], xi)
-
-
-def linear_slacks(table: Table, force: Float[Array, "slots 5"]) -> Float[Array, "rows 5"]:
-    """Coefficients of everything whose least value is the least `forces.slack`: of either side of a friction cone.
-
-    Four constraints have at most two tangential rows, and so six rows here; those not needed repeat the first.
-    """
-    normal = table.grip[:, None] * jnp.roll(force, 1, axis=0)
-    one_side = jnp.where(table.tangential[:, None], normal - force, force)
-    rolling = jnp.nonzero(table.tangential, size=MOST_ROLLING, fill_value=-1)[0]
-    other = jnp.where(rolling[:, None] >= 0, (normal + force)[rolling], force[0])
-    return jnp.concatenate([one_side, other])
 
 
 def hold(table: Table, s, v=0.0, a=0.0) -> Hold:
