@@ -5,8 +5,8 @@ at each `s` one 5x5 linear system gives everything (the paper's eqs. 1-4 and 12-
 
     [ M x , -(G_n - Xi U G_t)^T ] [a ; c_n] = E tau + g - M x' v^2 - B x v - D sgn(x v)
 
-A contact that rolls has no friction law, `Xi = 0`, but a column `-G_t^T` with its tangential force `c_t` as unknown. The
-answer is linear in `(1, v^2, v, tau1, tau2)`. For forward travel the coefficients are functions of `s` alone, here
+A contact that rolls has no friction law, `Xi = 0`, but a column `-G_t^T` with its tangential force `c_t` as unknown.
+The answer is linear in `(1, v^2, v, tau1, tau2)`. For forward travel the coefficients are functions of `s` alone, here
 tabulated as one polynomial a panel of the wire.
 """
 
@@ -28,10 +28,10 @@ class Table(eqx.Module):
     """A reduced wire: polynomials in the panel coordinate `xi` in [-1, 1], lowest power first, SI units.
 
     `acceleration[p, k]` are the coefficients of `a = ds^2/dt^2` in `(1, v^2, v, tau1, tau2)`, `backward[p, k]` those in
-    `(1, tau1, tau2)` for travel the other way at rest, `force[p, k, i]` those of the force in constraint `i` [N]: `c_n`,
-    or `c_t` where `tangential` (a contact that rolls), with `grip` its friction coefficient (0 elsewhere).
-    `configuration[p, k]` are those of `z`, `velocity[p, k]` those of `dz/ds`. `tension[piece, i]` is `c_t / c_n` (eq. 3)
-    where a contact slides.
+    `(1, tau1, tau2)` for travel the other way at rest, `force[p, k, i]` those of the force in constraint `i` [N]:
+    `c_n`, or `c_t` where `tangential` (a contact that rolls), with `grip` its friction coefficient (0 elsewhere).
+    `configuration[p, k]` are those of `z`, `velocity[p, k]` those of `dz/ds`. `tension[piece, i]` is `c_t / c_n`
+    (eq. 3) where a contact slides.
     `error` is the largest interpolation error, relative to each function's own size; `condition` the largest
     condition number of the 5x5 matrix, at `condition_s`.
     """
@@ -81,7 +81,8 @@ def along_wire(system: System, z, u):
     rows = jnp.concatenate([constraint_rows(system.contacts, z), u[None]])
     unit = jnp.zeros(5, z.dtype).at[4].set(1.0)
     x = jnp.linalg.solve(rows, unit)
-    bend = jnp.linalg.solve(rows, jnp.concatenate([-constraint_curvature(system.contacts, z, x), jnp.zeros(1, z.dtype)]))
+    left = -constraint_curvature(system.contacts, z, x)
+    bend = jnp.linalg.solve(rows, jnp.concatenate([left, jnp.zeros(1, z.dtype)]))
     return x, bend
 
 

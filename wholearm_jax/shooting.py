@@ -55,8 +55,9 @@ class Variables(eqx.Module):
 
 
 class Shot(NamedTuple):
-    """Intervals simulated: forces' slacks [N] (`forces.linear_slacks`) at every sample, the sample's share of the phase (0: none), the speed at the
-    interval's start and inside it in wire lengths a duration, and the state at its end as in `Variables`."""
+    """Intervals simulated: forces' slacks [N] (`forces.linear_slacks`) at every sample, the sample's share of the phase
+    (0: none), the speed at the interval's start and inside it in wire lengths a duration, and the state at its end as
+    in `Variables`."""
 
     forces: Float[Array, "*intervals samples rows"]
     weight: Float[Array, "*intervals samples"]

@@ -1,6 +1,7 @@
 r"""Trace: the curve `z(s)` on which a formation of four constraints moves, its ends, kinks and nodes.
 
-Four C-functions (gaps, and the places where rolling contacts touch) in five unknowns leave a wire that depends on geometry alone. It is charted by the linear coordinate
+Four C-functions (gaps, and the places where rolling contacts touch) in five unknowns leave a wire that depends on
+geometry alone. It is charted by the linear coordinate
 `s = s_ref + u . (z - z_ref)` (object units, see `system`), `u` being the unit tangent where the chart begins; a wire
 that turns away from `u` continues in a new chart, so turning points of single coordinates are nothing special. The
 search below (march, watch, bracket) runs on constants; every place that it finds is then the root of five equations
