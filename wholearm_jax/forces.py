@@ -136,7 +136,7 @@ def slacks_on(table: Table, seen: Window, duration, arc: Arcs, xi, kind=slack) -
 def sampled_slacks(
     table: Table, seen: Window, duration, steps: Arcs, samples: int = SAMPLES, kind=slack
 ) -> Float[Array, "steps samples rows"]:
-    """`slack` (or `linear_slacks`) at evenly spaced places of every step, ends included; infinite where nothing moves."""
+    """`slack` (or `linear_slacks`) at evenly spaced places of every step, ends included; infinite where all rests."""
     xi = jnp.linspace(0.0, 1.0, samples, dtype=steps.quintic.dtype)
     on = partial(slacks_on, kind=kind)
     at = jax.vmap(jax.vmap(on, (None, None, None, None, 0)), (None, None, None, 0, None))
