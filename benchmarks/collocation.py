@@ -16,7 +16,7 @@ functions and exact second derivatives.
 
 Where a slip reverses, `A` and `F` jump at a known place but at an unknown time. The interval in which the motion
 passes it is divided there and its time is a variable: no smoothing, and no loss of order. Which interval that is
-follows from the first guess, and moves on while the optimum lies at the interval's end.
+follows from the first guess, and moves on while the optimum lies at the interval's end (`_climbed`).
 """
 
 import argparse
@@ -41,10 +41,11 @@ from wholearm_jax.squeeze import holds
 jax.config.update("jax_enable_x64", True)
 
 KNOTS, DEGREE = 31, 3
+FINE = 120  # collocation intervals of the best that is known
 FIT = 1e-10  # relative error of the series that stand for the table
 BELLS = tuple((p, q) for p in (1, 2, 4, 8) for q in (1, 2, 4, 8))  # motions with speed ~ u^p (1 - u)^q
 MINIMUM_JERK = (2, 2)
-MOVES, WIDELY = 6, 20  # intervals of reversals tried, and where none is to be missed
+MOVES, WIDELY = 12, 20  # intervals of reversals tried, and where none is to be missed
 SETTINGS = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "ipopt.max_iter": 1000, "ipopt.tol": 1e-8}
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
@@ -86,8 +87,8 @@ class Collocated:
     `course.least` [N] is the least force at the collocation points, `ipopt` its status. `margin` [N] and `verdict` are
     those of the honest simulation of `torque` (knots x 2, N m); `missed` is the distance to the wire's end that it
     leaves and `speed` the speed, in wire lengths and in these a duration. It took `solves` solves, `iterations` in all,
-    in `solve` seconds after `build` seconds of building. Of the `guesses` tried one after the other only `spent` counts
-    all, in seconds.
+    in `solve` seconds (the best of them alone in `best_solve`) after `build` seconds of building. Of the `guesses`
+    tried one after the other only `spent` counts all, in seconds.
     """
 
     torque: np.ndarray
@@ -101,6 +102,7 @@ class Collocated:
     solves: int
     build: float
     solve: float
+    best_solve: float
     guesses: int = 1
     spent: float = 0.0
 
@@ -128,7 +130,7 @@ def collocate(table: Table, duration: float, *, knots: int = KNOTS) -> Collocate
     phase = Phase(read(table), duration, knots, 1)
     tried: list[Collocated] = []
     for bell in dict.fromkeys((MINIMUM_JERK, _hardest(table, duration), (1, 1))):
-        solves = _climbed(phase, _course(table, phase, bell), {"expand": True}, widely=False)
+        solves = _climbed(phase, _course(table, phase, bell), {"expand": True})
         tried.append(_collected(table, phase, solves))
         if tried[-1].succeeded:
             break
@@ -136,11 +138,11 @@ def collocate(table: Table, duration: float, *, knots: int = KNOTS) -> Collocate
     return replace(best, guesses=len(tried), spent=sum(one.build + one.solve for one in tried))
 
 
-def best_known(table: Table, duration: float, coarse: Collocated, *, refine: int = 4) -> Collocated:
+def best_known(table: Table, duration: float, coarse: Collocated) -> Collocated:
     """The largest margin that collocation can find with the same knots, whatever it costs.
 
-    From a coarse solution: reversals are first tried in every interval. Then `refine` collocation intervals are laid
-    between knots and those of reversals searched widely, with IPOPT's two strategies for its barrier; from two bell
+    From a coarse solution: reversals are first tried in every interval. Then each interval is divided, into `FINE` or
+    more in all, and those of reversals searched widely, with IPOPT's two strategies for its barrier; from two bell
     motions as well. Forces are then held at so many times that the simulated margin is close to the programme's.
     """
     knots = len(coarse.torque)
@@ -152,10 +154,10 @@ def best_known(table: Table, duration: float, coarse: Collocated, *, refine: int
         ordered = [one for one in tries if list(one) == sorted(one)]
         found = max((_once(phase, course, one, splits, {}) for one in ordered), key=lambda one: one.rank)
         course = found.course if found.course.least > course.least else course
-    fine = phase._replace(refine=refine)
+    fine = phase._replace(refine=-(-FINE // phase.intervals))
     bells = [_course(table, fine, bell) for bell in (MINIMUM_JERK, _hardest(table, duration))]
     starts = [(course, {}), (course, {"ipopt.mu_strategy": "adaptive"}), *((one, {}) for one in bells)]
-    each = [_collected(table, fine, _climbed(fine, start, options, widely=True)) for start, options in starts]
+    each = [_collected(table, fine, _explored(fine, start, options)) for start, options in starts]
     return max(each, key=lambda one: (one.succeeded, one.margin))
 
 
@@ -435,17 +437,47 @@ def _once(phase: Phase, course: Course, rows: tuple[int, ...], splits: np.ndarra
     return Solve(stats["return_status"], rows, splits, reached, stats["iter_count"], built - begun, done - built)
 
 
-def _climbed(phase: Phase, course: Course, options: dict[str, Any], *, widely: bool) -> list[Solve]:
-    """Solve from a course, and again with other intervals for the reversals for as long as that gains."""
-    waiting, done = [_passed(phase, course)], []
-    while waiting and len(done) < (WIDELY if widely else MOVES):
-        best = max(done, key=lambda one: one.rank, default=None)
-        new = _once(phase, best.course if best else course, *waiting.pop(0), options)
-        done.append(new)
-        if best is None or new.rank > best.rank:
-            seen = [one.rows for one in done]
-            waiting = [one for one in _neighbours(phase, new.rows, new.splits, widely) if one[0] not in seen]
+def _climbed(phase: Phase, course: Course, options: dict[str, Any]) -> list[Solve]:
+    """Solve from a course; while a reversal lies at its interval's end move it on, further as long as that gains."""
+    done, stride = [_once(phase, course, *_passed(phase, course), options)], 1
+    while len(done) < MOVES:
+        best = max(done, key=lambda one: one.rank)
+        step = np.where(best.splits < 1e-3, -stride, np.where(best.splits > 1 - 1e-3, stride, 0))
+        ahead = _beside(phase, best, step)
+        if ahead is not None and ahead[0] not in [one.rows for one in done]:
+            done.append(_once(phase, best.course, *ahead, options))
+            stride = 2 * stride if done[-1].rank > best.rank else 1
+        elif stride > 1:
+            stride = 1
+        else:
+            break
     return done
+
+
+def _explored(phase: Phase, course: Course, options: dict[str, Any]) -> list[Solve]:
+    """Solve from a course, and again with each reversal one or two intervals aside for as long as that gains."""
+    done = [_once(phase, course, *_passed(phase, course), options)]
+    best, waiting = done[0], []
+    while len(done) < WIDELY:
+        if best is done[-1]:
+            steps = (step * one for step in (1, -1, 2, -2) for one in np.eye(len(best.rows), dtype=int))
+            waiting = [beside for beside in (_beside(phase, best, step) for step in steps) if beside]
+        waiting = [beside for beside in waiting if beside[0] not in [one.rows for one in done]]
+        if not waiting:
+            break
+        done.append(_once(phase, best.course, *waiting.pop(0), options))
+        best = max(done, key=lambda one: one.rank)
+    return done
+
+
+def _beside(phase: Phase, solve: Solve, step: np.ndarray) -> tuple[tuple[int, ...], np.ndarray] | None:
+    """The intervals of a solve's reversals moved by `step`, and where to divide them; None where that cannot be."""
+    if not np.any(step):
+        return None
+    moved = np.clip(np.array(solve.rows, int) + step, 0, phase.intervals - 1)
+    if np.any(np.diff(moved) < 0):
+        return None
+    return tuple(moved.tolist()), np.where(step < 0, 0.98, np.where(step > 0, 0.02, solve.splits))
 
 
 def _collected(table: Table, phase: Phase, solves: list[Solve]) -> Collocated:
@@ -464,22 +496,9 @@ def _collected(table: Table, phase: Phase, solves: list[Solve]) -> Collocated:
         missed=(float(table.breaks[-1]) - float(outcome.motion.s[last])) / phase.wire.length,
         speed=float(outcome.motion.w[last]) / phase.wire.length,
         solves=len(solves),
+        best_solve=best.solve,
         **{name: sum(getattr(one, name) for one in solves) for name in ("iterations", "build", "solve")},
     )
-
-
-def _neighbours(phase: Phase, rows: tuple[int, ...], splits: np.ndarray, widely: bool):
-    """Rows and splits to try next: every reversal at its interval's end moved beyond it, or `widely` each by 1 or 2."""
-    if widely:
-        steps = [step * one for step in (1, -1, 2, -2) for one in np.eye(len(rows), dtype=int)]
-    else:
-        steps = [np.where(splits < 1e-3, -1, np.where(splits > 1 - 1e-3, 1, 0))]
-    found = []
-    for step in steps:
-        moved = np.array(rows, int) + step
-        if np.any(step) and moved.min() >= 0 and moved.max() < phase.intervals and np.all(np.diff(moved) >= 0):
-            found.append((tuple(moved.tolist()), np.where(step < 0, 0.98, np.where(step > 0, 0.02, splits))))
-    return found
 
 
 def _pack(programme: Programme, course: Course, splits: np.ndarray) -> np.ndarray:

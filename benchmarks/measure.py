@@ -9,6 +9,9 @@ from collections.abc import Callable, Mapping
 from importlib import metadata
 from pathlib import Path
 
+# Solving small systems on several threads costs more than it gains: they wait for one another, spinning.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 
 RESULTS = Path(__file__).parent / "results"

@@ -4,8 +4,9 @@
 
 A polygon is laid with one edge on the palm and both fingers are closed until each touches a vertex: four contacts,
 whose wire is followed either way. Where it ends a fifth contact is made; giving up one of the old four leaves the
-next formation. A plan is kept when every phase can be traced, is of real length, and has a bound (`wholearm_jax.bounds`)
-that is clearly positive: some torque can hold it everywhere. Whether one torque schedule can is left to the optimisers.
+next formation. A plan is kept when every phase can be traced, is of real length, and has a bound
+(`wholearm_jax.bounds`) that is clearly positive: some torque can hold it everywhere. Whether one torque schedule can is
+left to the optimisers.
 """
 
 import argparse

@@ -11,7 +11,7 @@ from wholearm_jax import plan
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
     *("status", "scene", "contacts", "system", "newton", "wire", "reduction", "schedule", "motion", "forces"),
-    *("verdict", "plan", "squeeze", "shooting", "descent", "optimiser", "baseline"),
+    *("verdict", "plan", "squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
     *("writing", "scene_file", "result_file", "drawing", "__init__", "command"),
 )
 
@@ -52,6 +52,6 @@ def test_scenes_of_one_size_share_their_programs():
         scene = wa.load(name)
         with jax.log_compiles(False):
             wa.simulate(scene, wa.quasistatic(scene))
-        sizes = (plan.prepare._cached._cache_size(), plan.run._cached._cache_size())
+        sizes = (plan.prepare._cached._cache_size(), plan._run._cached._cache_size())
         count(sizes)
     assert len(compiled) == 1, f"a later scene compiled again: {compiled}"

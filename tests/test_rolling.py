@@ -269,7 +269,7 @@ def test_bound_and_hold_see_the_cone(rolling):
     assert float(found.margin) == pytest.approx(slack.max(), abs=2e-3 * np.abs(forces).max())
     assert float(found.margin) >= slack.max() - 1e-12
     at = jax.vmap(lambda s: squeeze.hold(table, s).margin)(table.breaks[0] + table.length * jnp.linspace(0.0, 1.0, 65))
-    assert float(squeeze.bound(table, jnp.asarray(DURATION), False).value) >= float(at.min()) - 1e-9
+    assert float(squeeze.bound(table, jnp.asarray(DURATION), False, False).value) >= float(at.min()) - 1e-9
 
 
 def test_gradients():

@@ -251,7 +251,7 @@ NUMBERS = [
     ((*PHASE, "toward", "x"), "phase[1].toward: 'x' is not a coordinate and a sign"),
     ((*PHASE, "toward", "z-"), "phase[1].toward: 'z-' is not a coordinate and a sign"),
     ((*PHASE, "toward", ""), "phase[1].toward: '' is not a coordinate and a sign"),
-    ((*PHASE, "arrive", "flying"), "phase[1].arrive: must be 'rest' or 'moving'"),
+    ((*PHASE, "arrive", "flying"), "phase[1].arrive: must be 'rest', 'moving' or 'caught'"),
     ((*PHASE, "name", 3), "phase[1].name: must be text"),
     (("phase", []), "phase: must have at least 1 item"),
     (("object", 3), "object: must be a table"),

@@ -5,7 +5,7 @@ a share of their limits (a few shares are tried, since the paper only says that 
 the torque of the pushing finger is raised by 10 % until the object begins to move, raised on while every contact stays
 compressive, and lowered by 10 % when a contact opens; the last torque that works is recorded. Each phase therefore
 begins with a step in the torque, and ends as soon as its wire does, at whatever speed: a phase of the search arrives
-`moving`, and the next is taken to start from rest.
+`caught`, and the next is taken to start from rest.
 """
 
 import time
@@ -63,7 +63,7 @@ def search(scene: Scene, *, longest: float = 10.0) -> Searched:
 
 
 def _arriving(phase: Phase) -> Phase:
-    return Phase(phase.name, phase.formation, phase.heading, phase.duration, arrive="moving")
+    return Phase(phase.name, phase.formation, phase.heading, phase.duration, arrive="caught")
 
 
 def _search_phase(at: Traced, longest: float) -> tuple[np.ndarray, float, int]:

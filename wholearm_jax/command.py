@@ -1,4 +1,4 @@
-"""The command line: `wholearm optimise`, `simulate`, `search`, `scenes`.
+"""The command line: `wholearm optimise`, `simulate`, `search`, `formations`, `scenes`.
 
 Exit status 0 when the result is `ok`, 1 when the plan fails (its status is printed), 2 for bad input, in one line.
 """
@@ -29,6 +29,9 @@ class _BadInput(Exception):
 
 def main() -> None:
     """Run the command line."""
+    # Solving small systems on several threads costs more than it gains: they wait for one another, spinning.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("MPLBACKEND", "agg")
     jax.config.update("jax_enable_x64", True)
     _keep_compiled()
     from wholearm_jax.scene_file import SceneError
@@ -129,6 +132,45 @@ def simulate(
 
 
 @app.command()
+def formations(
+    scene: SceneName,
+    after: Annotated[str | None, typer.Option(help="A phase, by name or number: list what can follow its end.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for a picture of all ways, formations.svg and .png.")] = None,
+) -> None:
+    """List the formations of four contacts that hold at a configuration, and where their wires lead."""
+    loaded = _scene(scene, None)
+    folder = _folder(out)
+    from rich.console import Console
+    from rich.table import Table
+
+    from wholearm_jax.formations import leaving, start_configuration, touching, ways
+    from wholearm_jax.plan import end_configuration
+
+    traced = _traced(scene, loaded)
+    if after is None:
+        z, z_dot = start_configuration(traced[0].table), None
+    else:
+        row = _phase_number(loaded, after)
+        if row is None:
+            names = ", ".join(p.name for p in loaded.phases)
+            raise _BadInput(f"--after {after}: no such phase; phases: {names}")
+        z, z_dot = end_configuration(traced[row]), leaving(traced[row].table)
+    found = ways(loaded, z, z_dot)
+    table = Table(title=f"touching: {', '.join(touching(loaded, z))}")
+    for column in ("contacts", "toward", "leads to", "length", "static N", "bound N", "enter at speed"):
+        table.add_column(column, justify="left" if column in ("contacts", "toward", "leads to") else "right")
+    for way in found:
+        held = f"{way.static:.3f}" if way.static > float("-inf") else "-"
+        top = f"{way.bound:.3f}" if way.bound > float("-inf") else "-"
+        table.add_row(" ".join(way.contacts), way.toward, way.ends, f"{way.length:.2f}", held, top, way.entering)
+    Console().print(table)
+    if folder is not None:
+        from wholearm_jax.drawing import draw_ways
+
+        _save_figure(draw_ways(loaded, z, found), folder, "formations")
+
+
+@app.command()
 def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
     """The paper's search for torques by steps of 10 %."""
     loaded = _scene(scene, None)
@@ -199,8 +241,7 @@ def _changed(scene, change: str):
     key, _, value = change.partition("=")
     phase, _, field = key.rpartition(".")
     names = [p.name for p in scene.phases]
-    numbered = phase.isdecimal() and int(phase) < len(names)
-    row = names.index(phase) if phase in names else int(phase) if numbered else None
+    row = _phase_number(scene, phase)
     if field != "duration" or row is None:
         raise _BadInput(f"--set {change}: write PHASE.duration=SECONDS; phases: {', '.join(names)}")
     try:
@@ -211,6 +252,13 @@ def _changed(scene, change: str):
         raise _BadInput(f"--set {change}: a duration is a positive number of seconds")
     phases = tuple(replace_duration(p, seconds) if k == row else p for k, p in enumerate(scene.phases))
     return eqx.tree_at(lambda s: s.phases, scene, phases)
+
+
+def _phase_number(scene, phase: str) -> int | None:
+    """The number of a phase given by name or number."""
+    names = [p.name for p in scene.phases]
+    numbered = phase.isdecimal() and int(phase) < len(names)
+    return names.index(phase) if phase in names else int(phase) if numbered else None
 
 
 def _folder(out: Path | None) -> Path | None:
@@ -244,25 +292,26 @@ def _finish(result, folder: Path | None, samples: int, **more) -> None:
 
 
 def _draw(result, folder: Path) -> None:
-    import io
-
-    import matplotlib
-
-    matplotlib.use("agg")
-    import matplotlib.pyplot as plt
-
     from wholearm_jax.drawing import draw_result, draw_strip
     from wholearm_jax.plan import trajectory
-    from wholearm_jax.writing import write_whole
 
     figures = {"plan": draw_strip, "result": draw_result} if trajectory(result) else {}  # no motion, nothing to draw
     for name, draw in figures.items():
-        figure = draw(result)
-        for kind in ("png", "svg"):
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format=kind, dpi=150, bbox_inches="tight")
-            write_whole(folder / f"{name}.{kind}", buffer.getvalue())
-        plt.close(figure)
+        _save_figure(draw(result), folder, name)
+
+
+def _save_figure(figure, folder: Path, name: str) -> None:
+    import io
+
+    import matplotlib.pyplot as plt
+
+    from wholearm_jax.writing import write_whole
+
+    for kind in ("png", "svg"):
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=kind, dpi=150, bbox_inches="tight")
+        write_whole(folder / f"{name}.{kind}", buffer.getvalue())
+    plt.close(figure)
 
 
 if __name__ == "__main__":

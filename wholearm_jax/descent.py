@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.forces import smooth_margin, spare
 from wholearm_jax.motion import Integration
-from wholearm_jax.reduction import Table
+from wholearm_jax.reduction import Table, change, horner, powers
 from wholearm_jax.shooting import PARTS, ROWS, SAMPLES, STEPS, Variables, local, shoot
 from wholearm_jax.squeeze import coefficients
 
@@ -41,13 +41,13 @@ JOINED = 1e-9  # sum of the defects below which the intervals count as joined
 
 class Limits(eqx.Module):
     """What the result must respect: torque rates [N m/s], durations [s], which knots' torques stay as they are; and
-    the `unit` of forces [N]."""
+    each phase's `unit` of forces [N]."""
 
     rate: Float[Array, "2"]
     shortest: Float[Array, ""]
     longest: Float[Array, ""]
-    pinned: Bool[Array, "knots"]
-    unit: Float[Array, ""]
+    pinned: Bool[Array, "phases knots"]
+    unit: Float[Array, "phases"]
 
 
 class Rooms(NamedTuple):
@@ -60,19 +60,21 @@ class Rooms(NamedTuple):
 
 
 class Linear(NamedTuple):
-    """All intervals at `p` with derivatives: `at` and `rates` (last axis: an interval's seven numbers), the defects `e`
-    and `E = de/dp`; `bears` marks the rooms that the margin lowers, `still` the variables that stay."""
+    """All intervals at `p` with derivatives: `at` and `rates` (last axis: an interval's seven numbers), what must
+    vanish, `defect`, and its derivatives `across`; `loose` marks rows of them that do not bind, `bears` the rooms that
+    the margin lowers, `still` the variables that stay."""
 
     at: Rooms
     rates: Rooms
-    defect: Float[Array, "intervals 2"]
+    defect: Float[Array, "e"]
     across: Float[Array, "e p"]
+    loose: Bool[Array, "e"]
     bears: Float[Array, "rooms"]
     still: Bool[Array, "p"]
 
 
-def rooms(q: Float[Array, "7"], later: Float[Array, ""], table: Table, limits: Limits, how, intervals: int) -> Rooms:
-    """One interval; `later` is 0 for the first, which starts at rest, and 1 for the others."""
+def rooms(q: Float[Array, "7"], later, unit, table: Table, limits: Limits, how, intervals: int) -> Rooms:
+    """One interval; `later` is 0 where it starts at rest, and 1 for all others."""
     shot = shoot(table, how, intervals, q)
     torque, log = q[2:6], q[6]
     bounded = jnp.isfinite(limits.rate)
@@ -81,7 +83,7 @@ def rooms(q: Float[Array, "7"], later: Float[Array, ""], table: Table, limits: L
     span = jnp.log(limits.longest / limits.shortest)
     free = span > 0
     ends = jnp.stack([log - jnp.log(limits.shortest), jnp.log(limits.longest) - log]) / jnp.where(free, span, 1.0)
-    room = [(shot.forces / limits.unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, shot.pace, ends]
+    room = [(shot.forces / unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, shot.pace, ends]
     one = jnp.full((), 1 / intervals)
     sampled = (shot.weight[:, None] * ~spare(table)).ravel()
     climbs = jnp.tile(jnp.where(bounded, one / 4, 0.0), 2)
@@ -90,75 +92,128 @@ def rooms(q: Float[Array, "7"], later: Float[Array, ""], table: Table, limits: L
     return Rooms(jnp.concatenate(room), jnp.concatenate(weight), shot.end)
 
 
-def linearise(p: Variables, table: Table, limits: Limits, how: Integration) -> Linear:
+def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> Linear:
     """Simulate all intervals, with first derivatives by forward mode."""
-    knots = p.torque.shape[0]
+    phases, knots = p.torque.shape[:2]
 
-    def both(q, later):
-        at = rooms(q, later, table, limits, how, knots - 1)
+    def both(q, later, unit, table):
+        at = rooms(q, later, unit, table, limits, how, knots - 1)
         return at, at
 
-    rates, at = jax.vmap(jax.jacfwd(both, has_aux=True))(local(p), (np.arange(knots - 1) > 0) * 1.0)
-    columns, ends = _columns(knots)
-    each = np.arange(2 * (knots - 1))
-    across = jnp.zeros((2 * (knots - 1), 4 * knots + 1))
-    across = across.at[each[:, None], np.repeat(columns, 2, axis=0)].add(rates.end.reshape(-1, columns.shape[1]))
-    across = across.at[each, ends.ravel()].add(-1.0)
-    still = _still(limits, knots)
-    bears = np.arange(at.room.shape[1]) < PARTS * STEPS * SAMPLES * ROWS
-    return Linear(at, rates, at.end - p.state[1:], jnp.where(still, 0.0, across), jnp.asarray(bears * 1.0), still)
+    each = jax.vmap(jax.vmap(jax.jacfwd(both, has_aux=True), (0, 0, None, None)))
+    later = np.ones((phases, knots - 1))
+    later[0, 0] = 0.0
+    rates, at = each(local(p), later, limits.unit, tables)
+    columns, ends = _columns(phases, knots)
+    row = np.arange(ends.size)
+    n = 4 * phases * knots + phases
+    across = jnp.zeros((ends.size, n))
+    across = across.at[row[:, None], np.repeat(columns.reshape(-1, 7), 2, axis=0)].add(rates.end.reshape(-1, 7))
+    across = across.at[row, ends.ravel()].add(-1.0)
+    defect = (at.end - p.state[:, 1:]).ravel()
+    flat, unravel = ravel_pytree(p)
+
+    def seams(x):
+        return _seams(unravel(x), tables, limits)
+
+    loose = jnp.concatenate([jnp.zeros(defect.size, bool), _loose_seams(phases, limits)])
+    bears = np.arange(at.room.shape[2]) < PARTS * STEPS * SAMPLES * ROWS
+    return Linear(
+        at,
+        rates,
+        jnp.concatenate([defect, seams(flat)]),
+        jnp.concatenate([across, jax.jacfwd(seams)(flat)]),
+        loose,
+        jnp.asarray(bears * 1.0),
+        _still(limits, phases, knots),
+    )
 
 
-def _columns(knots: int) -> tuple[Int[np.ndarray, "intervals 7"], Int[np.ndarray, "intervals 2"]]:
+def _seams(p: Variables, tables: Table, limits: Limits) -> Float[Array, "seams"]:
+    """What must vanish where one phase takes over from another at speed: the error of the speed after the impact, and,
+    where torque rates are limited, the torques' steps."""
+    if p.torque.shape[0] == 1:
+        return jnp.zeros(0)
+    before, after = (jax.tree.map(lambda a, k=k: a[k], tables) for k in (slice(0, -1), slice(1, None)))
+    speed = before.length / jnp.exp(p.log_duration[:-1]) * p.state[:-1, -1, 1]
+    lost = p.state[1:, 0, 1] - passed_on(before, after) * speed * jnp.exp(p.log_duration[1:]) / after.length
+    jump = (p.torque[1:, 0] - p.torque[:-1, -1]) * jnp.isfinite(limits.rate)
+    return jnp.concatenate([lost, jump.ravel()])
+
+
+def passed_on(before: Table, after: Table) -> Float[Array, "seams"]:
+    """`ds/dt` after the change of formation over that before it, tables stacked along the first axis."""
+
+    def one(before, after):
+        panel, xi = powers(before, before.count - 1, before.breaks[-1])
+        return change(after, horner(before.velocity[panel], xi)).speed
+
+    return jax.vmap(one)(before, after)
+
+
+def _loose_seams(phases: int, limits: Limits) -> Bool[Array, "seams"]:
+    free = jnp.tile(~jnp.isfinite(limits.rate), phases - 1)
+    return jnp.concatenate([jnp.zeros(phases - 1, bool), free])
+
+
+def _columns(phases: int, knots: int) -> tuple[Int[np.ndarray, "phases intervals 7"], Int[np.ndarray, "..."]]:
     """Where in the flattened `Variables` each interval's seven numbers and its end state stand."""
-    torque, state = np.arange(2 * knots).reshape(knots, 2), np.arange(2 * knots, 4 * knots).reshape(knots, 2)
-    duration = np.full((knots - 1, 1), 4 * knots)
-    return np.concatenate([state[:-1], torque[:-1], torque[1:], duration], axis=1), state[1:]
+    size = 2 * phases * knots
+    torque, state = np.arange(size).reshape(phases, knots, 2), np.arange(size, 2 * size).reshape(phases, knots, 2)
+    duration = np.broadcast_to(2 * size + np.arange(phases)[:, None, None], (phases, knots - 1, 1))
+    return np.concatenate([state[:, :-1], torque[:, :-1], torque[:, 1:], duration], axis=2), state[:, 1:]
 
 
-def _still(limits: Limits, knots: int) -> Bool[Array, "p"]:
-    """Pinned torques, the first and last state, and a fixed duration."""
-    ends = np.zeros((knots, 2), bool)
-    ends[[0, -1]] = True
-    fixed = limits.longest <= limits.shortest
-    return jnp.concatenate([jnp.repeat(limits.pinned, 2), jnp.asarray(ends.ravel()), fixed[None]])
+def _still(limits: Limits, phases: int, knots: int) -> Bool[Array, "p"]:
+    """Pinned torques, the places where wires start and end, rest at the first start and last end, fixed durations."""
+    ends = np.zeros((phases, knots, 2), bool)
+    ends[:, [0, -1], 0] = ends[0, 0] = ends[-1, -1] = True
+    fixed = jnp.broadcast_to(limits.longest <= limits.shortest, (phases,))
+    return jnp.concatenate([jnp.repeat(limits.pinned.ravel(), 2), jnp.asarray(ends.ravel()), fixed])
 
 
-def _gather(linear: Linear, values: Float[Array, "intervals rooms"]) -> Float[Array, "p"]:
+def _gather(linear: Linear, values: Float[Array, "phases intervals rooms"]) -> Float[Array, "p"]:
     """`J^T values`, with `J` the derivatives of all rooms."""
-    knots = linear.at.room.shape[0] + 1
-    columns, _ = _columns(knots)
-    pull = jnp.zeros(4 * knots + 1).at[columns].add(jnp.einsum("kr,krq->kq", values, linear.rates.room))
+    phases, intervals = values.shape[:2]
+    columns, _ = _columns(phases, intervals + 1)
+    pull = jnp.zeros(linear.still.shape[0]).at[columns].add(jnp.einsum("pkr,pkrq->pkq", values, linear.rates.room))
     return jnp.where(linear.still, 0.0, pull)
 
 
-def _metric(linear: Linear, values: Float[Array, "intervals rooms"]) -> Float[Array, "p p"]:
+def _metric(linear: Linear, values: Float[Array, "phases intervals rooms"]) -> Float[Array, "p p"]:
     """`J^T diag(values) J`, the identity for variables that stay."""
-    knots, still = linear.at.room.shape[0] + 1, linear.still
-    columns, _ = _columns(knots)
-    n = 4 * knots + 1
-    blocks = jnp.einsum("kr,krq,krp->kqp", values, linear.rates.room, linear.rates.room)
-    metric = jnp.zeros((n, n)).at[columns[:, :, None], columns[:, None, :]].add(blocks)
+    phases, intervals = values.shape[:2]
+    still, n = linear.still, linear.still.shape[0]
+    columns, _ = _columns(phases, intervals + 1)
+    blocks = jnp.einsum("pkr,pkrq,pkrs->pkqs", values, linear.rates.room, linear.rates.room)
+    metric = jnp.zeros((n, n)).at[columns[..., :, None], columns[..., None, :]].add(blocks)
     return jnp.where(still[:, None] | still, 0.0, metric) + jnp.diag(jnp.where(still, 1.0, 1e-8))
+
+
+def _change_of_rooms(linear: Linear, way: Float[Array, "p"]) -> Float[Array, "phases intervals rooms"]:
+    """`J way`."""
+    phases, intervals = linear.at.room.shape[:2]
+    columns, _ = _columns(phases, intervals + 1)
+    return jnp.einsum("pkrq,pkq->pkr", linear.rates.room, way[columns])
 
 
 class Duals(NamedTuple):
     """The interior point's own unknowns: slack and price of every room, the level `m` of the margin (NaN: not yet
     chosen), the temperature, and the shares of its last step that were taken."""
 
-    slack: Float[Array, "intervals rooms"]
-    price: Float[Array, "intervals rooms"]
+    slack: Float[Array, "phases intervals rooms"]
+    price: Float[Array, "phases intervals rooms"]
     level: Float[Array, ""]
     temperature: Float[Array, ""]
     steps: Float[Array, "2"]
 
 
-def interior_point() -> optax.GradientTransformationExtraArgs:
+def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
     """The primal-dual direction as an optax transformation; wants `linear=`, and makes its own gradient from it."""
 
     def init(params):
-        intervals = (params.shape[0] - 1) // 4 - 1
-        shape = (intervals, PARTS * STEPS * SAMPLES * ROWS + 8 + 4 + STEPS + 2)
+        knots = (params.shape[0] // phases - 1) // 4
+        shape = (phases, knots - 1, PARTS * STEPS * SAMPLES * ROWS + 8 + 4 + STEPS + 2)
         start = jnp.full((), HOTTEST)
         return Duals(jnp.ones(shape), jnp.zeros(shape), jnp.full((), jnp.nan), start, jnp.zeros(2))
 
@@ -176,11 +231,10 @@ def interior_point() -> optax.GradientTransformationExtraArgs:
         miss = given - slack
         aim = jnp.where(live, target - stiff * miss, 0.0)
         way, rise = _solve(linear, stiff, aim)
-        columns, _ = _columns(at.room.shape[0] + 1)
-        dslack = jnp.einsum("krq,kq->kr", linear.rates.room, way[columns]) - bears * rise + miss
+        dslack = _change_of_rooms(linear, way) - bears * rise + miss
         dslack = jnp.where(live, dslack, 0.0)
         dprice = jnp.where(live, target - price - stiff * dslack, 0.0)
-        primal = jnp.minimum(_reach(slack, dslack), _cap(way))
+        primal = jnp.minimum(_reach(slack, dslack), _cap(linear, way))
         dual = _reach(price, dprice)
         both = jnp.minimum(primal, dual)
         cooling = jnp.where(both > 0.5, 0.2, jnp.where(both > 0.2, 0.6, 1.0))
@@ -198,14 +252,15 @@ def interior_point() -> optax.GradientTransformationExtraArgs:
 
 def _solve(linear: Linear, stiff, aim):
     """The step of `p` and of the margin's level: one symmetric system with the joining of the intervals."""
-    bears, across = linear.bears, linear.across
-    n, e = across.shape[1], across.shape[0]
+    bears, across = linear.bears, jnp.where(linear.still | linear.loose[:, None], 0.0, linear.across)
+    e, n = across.shape
     lean = _gather(linear, stiff * bears)
     matrix = jnp.zeros((n + 1 + e, n + 1 + e))
     matrix = matrix.at[:n, :n].set(_metric(linear, stiff)).at[n, n].set((stiff * bears).sum())
     matrix = matrix.at[:n, n].set(-lean).at[n, :n].set(-lean)
     matrix = matrix.at[:n, n + 1 :].set(across.T).at[n + 1 :, :n].set(across)
-    right = [_gather(linear, aim), (1 - (bears * aim).sum())[None], -linear.defect.ravel()]
+    matrix = matrix.at[n + 1 :, n + 1 :].set(-jnp.diag(1.0 * linear.loose))
+    right = [_gather(linear, aim), (1 - (bears * aim).sum())[None], jnp.where(linear.loose, 0.0, -linear.defect)]
     step = jnp.linalg.solve(matrix, jnp.concatenate(right))
     return step[:n], step[n]
 
@@ -216,23 +271,30 @@ def _reach(value, change):
     return jnp.minimum(1.0, NEAR * jnp.where(falls, -value / jnp.where(falls, change, 1.0), jnp.inf).min())
 
 
-def _cap(way):
+def _cap(linear: Linear, way):
     """The share of a step that keeps the states' changes within `LONGEST`."""
-    knots = (way.shape[0] - 1) // 4
-    change = jnp.abs(way[2 * knots : 4 * knots].reshape(knots, 2)).max(0)
+    phases, intervals = linear.at.room.shape[:2]
+    size = 2 * phases * (intervals + 1)
+    change = jnp.abs(way[size : 2 * size].reshape(-1, 2)).max(0)
     return (jnp.array(LONGEST) / jnp.maximum(change, 1e-30)).min()
 
 
-def _split(knots: int) -> tuple[Int[np.ndarray, "free"], Int[np.ndarray, "states"]]:
-    """Places in the flattened variables of torques and duration, and of all states but the first."""
-    return np.append(np.arange(2 * knots), 4 * knots), np.arange(2 * knots + 2, 4 * knots)
+def _follow(linear: Linear):
+    """How the states follow the torques and durations where intervals and phases join.
 
-
-def _follow(linear: Linear, free, states):
-    """How the states follow the torques and the duration where the intervals join: `follow @ change + apart`."""
-    across = linear.across.at[[-2, -1], states[-2:]].set(-1.0)
-    solved = jnp.linalg.solve(across[:, states], jnp.column_stack([across[:, free], linear.defect.ravel()]))
-    return -solved[:, :-1], -solved[:, -1]
+    Returns the places of torques and durations and of the states that follow in the flattened variables,
+    `follow` and `apart` with `states' change = follow @ change + apart`, and which of the states must not change.
+    """
+    phases, intervals = linear.at.room.shape[:2]
+    size = 2 * phases * (intervals + 1)
+    free = np.append(np.arange(size), np.arange(2 * size, 2 * size + phases))
+    place = np.arange(size, 2 * size).reshape(phases, intervals + 1, 2)
+    goals = np.append(place[:, -1, 0], place[-1, -1, 1])
+    states = np.setdiff1d(place, np.append(place[:, 0, 0], place[0, 0, 1]))
+    rows = np.arange(2 * phases * intervals + phases - 1)
+    right = jnp.column_stack([linear.across[rows][:, free], linear.defect[rows]])
+    solved = jnp.linalg.solve(linear.across[rows][:, states], right)
+    return free, states, -solved[:, :-1], -solved[:, -1], np.isin(states, goals)
 
 
 class Cooling(NamedTuple):
@@ -258,61 +320,59 @@ def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) ->
         above = at.room - linear.bears * level
         # Outside a limit the loss is infinite: there the pull back to it is that of a small room.
         pull = _gather(linear, hot * at.weight / jnp.maximum(above, hot))
-        free, states = _split(at.room.shape[0] + 1)
-        follow, apart = _follow(linear, free, states)
-        last = follow[-2:]
+        free, states, follow, apart, goal = _follow(linear)
+        last = follow[goal]
 
         def arriving(step, rest):
             return step - last.T @ jnp.linalg.solve(last @ last.T, last @ step + rest)
 
-        gradient = arriving(-pull[free] - follow[:-2].T @ pull[states[:-2]], 0.0)
+        gradient = arriving(-pull[free] - follow[~goal].T @ pull[states[~goal]], 0.0)
         updates, inner = optimiser.update(jnp.zeros_like(pull).at[free].set(gradient), state.inner, params, **extra)
-        step = arriving(jnp.where(linear.still, 0.0, jnp.asarray(updates))[free], apart[-2:])
-        way = jnp.zeros_like(pull).at[free].set(step).at[states[:-2]].set((follow @ step + apart)[:-2])
-        columns, _ = _columns(at.room.shape[0] + 1)
-        change = jnp.einsum("krq,kq->kr", linear.rates.room, way[columns])
+        step = arriving(jnp.where(linear.still, 0.0, jnp.asarray(updates))[free], apart[goal])
+        way = jnp.zeros_like(pull).at[free].set(step).at[states[~goal]].set((follow @ step + apart)[~goal])
+        change = _change_of_rooms(linear, way)
         within = (at.weight > 0) & (linear.bears == 0) & (at.room > 0)
-        share = jnp.minimum(_reach(jnp.where(within, at.room, 1.0), jnp.where(within, change, 0.0)), _cap(way))
+        reach = _reach(jnp.where(within, at.room, 1.0), jnp.where(within, change, 0.0))
+        share = jnp.minimum(reach, _cap(linear, way))
         cooled = jnp.maximum(cooling * hot, COLDEST)
         return share * way, Cooling(inner, level, cooled, jnp.stack([share, share]))
 
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
 
 
-def moved(p: Variables, way: Variables, share, table: Table, limits: Limits) -> Variables:
+def moved(p: Variables, way: Variables, share, tables: Table, limits: Limits) -> Variables:
     """`p` after a `share` of a direction, on the curve along which accelerations and squeezes at knots change evenly.
 
     Torques balance to a small remainder, the acceleration: where the state at a knot moves, they have to move with it.
     The curve's tangent is the direction. A knot that passes from one piece of the wire to another goes straight.
     """
-    limit, length = table.torque_limit, table.length
 
-    def balance(state, log):
+    def balance(table, state, log):
         """Acceleration in lengths a duration squared is `rest + pull . torque`, the squeeze `free . torque`."""
-        motion, _ = coefficients(table, table.breaks[0] + length * state[0])
+        motion, _ = coefficients(table, table.breaks[0] + table.length * state[0])
         time = jnp.exp(log)
-        v = state[1] * length / time
+        v = state[1] * table.length / time
         rest = motion[0] + motion[1] * v**2 + motion[2] * v
-        pull = motion[3:] * limit
+        pull = motion[3:] * table.torque_limit
         free = jnp.stack([-pull[1], pull[0]]) / jnp.sqrt(jnp.maximum(pull @ pull, 1e-300))
-        return time**2 / length * rest, time**2 / length * pull, free
+        return time**2 / table.length * rest, time**2 / table.length * pull, free
 
-    def knot(state, torque, dstate, dtorque, pinned):
+    def knot(table, log, dlog, state, torque, dstate, dtorque, pinned):
         def motion(state, torque, log):
-            rest, pull, free = balance(state, log)
+            rest, pull, free = balance(table, state, log)
             return rest + pull @ torque, free @ torque
 
-        tangents = (dstate, dtorque, way.log_duration)
-        (a, squeeze), (da, dsqueeze) = jax.jvp(motion, (state, torque, p.log_duration), tangents)
+        (a, squeeze), (da, dsqueeze) = jax.jvp(motion, (state, torque, log), (dstate, dtorque, dlog))
         there, straight = state + share * dstate, torque + share * dtorque
-        rest, pull, free = balance(there, p.log_duration + share * way.log_duration)
+        rest, pull, free = balance(table, there, log + share * dlog)
         size = pull @ pull
         curved = pull * (a + share * da - rest) / jnp.where(size > 0, size, 1.0) + free * (squeeze + share * dsqueeze)
-        piece = [(table.breaks[0] + length * s[0] >= table.breaks[1:-1]).sum() for s in (state, there)]
+        piece = [(table.breaks[0] + table.length * s[0] >= table.breaks[1:-1]).sum() for s in (state, there)]
         return jnp.where((piece[0] == piece[1]) & (size > 0) & ~pinned, curved, straight)
 
+    knots = jax.vmap(jax.vmap(knot, (None, None, None, 0, 0, 0, 0, 0)))
     return Variables(
-        jax.vmap(knot)(p.state, p.torque, way.state, way.torque, limits.pinned),
+        knots(tables, p.log_duration, way.log_duration, p.state, p.torque, way.state, way.torque, limits.pinned),
         p.state + share * way.state,
         p.log_duration + share * way.log_duration,
     )
@@ -321,8 +381,8 @@ def moved(p: Variables, way: Variables, share, table: Table, limits: Limits) -> 
 class Descent(NamedTuple):
     """A descent on its way: variables, the optimiser's state, and the step that led here, to take again if it failed.
 
-    `least` is the smallest sampled force over the bound and `apart` the sum of the defects, both of the variables
-    before the step (NaN where they cannot be simulated).
+    `least` is each phase's smallest sampled force over its unit and `apart` the sum of the defects, both of the
+    variables before the step (NaN where they cannot be simulated).
     """
 
     p: Variables
@@ -330,35 +390,35 @@ class Descent(NamedTuple):
     before: Variables
     way: Variables
     share: Float[Array, ""]
-    least: Float[Array, ""]
+    least: Float[Array, "phases"]
     apart: Float[Array, ""]
 
 
 @eqx.filter_jit
 def begin(p: Variables, optimiser) -> Descent:
     """A descent before its first step."""
-    zero = jnp.zeros(())
-    return Descent(p, optimiser.init(ravel_pytree(p)[0]), p, jax.tree.map(jnp.zeros_like, p), zero + 1, zero, zero)
+    zero, still = jnp.zeros(()), jax.tree.map(jnp.zeros_like, p)
+    return Descent(p, optimiser.init(ravel_pytree(p)[0]), p, still, zero + 1, 0 * p.log_duration, zero)
 
 
 @eqx.filter_jit
-def advance(d: Descent, table: Table, limits: Limits, how: Integration, optimiser) -> Descent:
+def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimiser) -> Descent:
     """Simulate, and take a step; where `d.p` cannot be simulated, go back and take a shorter one."""
-    linear = linearise(d.p, table, limits, how)
+    linear = linearise(d.p, tables, limits, how)
     at = linear.at
     sound = jnp.all(jnp.isfinite(at.room)) & jnp.all(jnp.isfinite(linear.defect))
-    least = jnp.where((at.weight > 0) & (linear.bears > 0), at.room, jnp.inf).min()
-    apart = jnp.abs(linear.defect).sum()
+    least = jnp.where((at.weight > 0) & (linear.bears > 0), at.room, jnp.inf).min((1, 2))
+    apart = jnp.where(linear.loose, 0.0, jnp.abs(linear.defect)).sum()
 
     def onward():
         flat, unravel = ravel_pytree(d.p)
         way, state = optimiser.update(jnp.zeros_like(flat), d.state, flat, linear=linear)
         way = unravel(way)
-        return Descent(moved(d.p, way, 1.0, table, limits), state, d.p, way, jnp.ones(()), least, apart)
+        return Descent(moved(d.p, way, 1.0, tables, limits), state, d.p, way, jnp.ones(()), least, apart)
 
     def again():
         share = d.share * SHORTER
         nan = jnp.full((), jnp.nan)
-        return d._replace(p=moved(d.before, d.way, share, table, limits), share=share, least=nan, apart=nan)
+        return d._replace(p=moved(d.before, d.way, share, tables, limits), share=share, least=nan + d.least, apart=nan)
 
     return jax.lax.cond(sound, onward, again)

@@ -45,6 +45,35 @@ def draw_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbe
     return ax
 
 
+def draw_ways(scene: Scene, z, ways, columns: int = 4) -> Figure:
+    """Where each way from configuration `z` leads: its end, with the start in grey; ways that can be traced only."""
+    shown = [way for way in ways if way.status.value == 0]
+    rows = max(1, -(-len(shown) // columns))
+    size = (1.9 * columns, 2.0 * rows)
+    figure, grid = plt.subplots(
+        rows, columns, figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained"
+    )
+    for ax in grid.flat:
+        ax.axis("off")
+    for ax, way in zip(grid.flat, shown, strict=False):
+        _ghost(scene, z, ax)
+        held = f"static {way.static:.2f} N" if np.isfinite(way.static) else "cannot be held"
+        label = f"{' '.join(way.contacts[:2])}\n{' '.join(way.contacts[2:])}\n{way.toward}: {way.ends}\n{held}"
+        draw_pose(scene, way.end, ax, label=label)
+        ax.title.set_fontsize(6)
+    return figure
+
+
+def _ghost(scene: Scene, z, ax: Axes) -> None:
+    """The object's outline at `z`, pale."""
+    z = np.asarray(z)
+    solid = body(scene.object)
+    corners = np.asarray(solid.vertices)[: int(solid.count)]
+    c, s = np.cos(z[2]), np.sin(z[2])
+    outline = corners @ np.array([[c, s], [-s, c]]) + z[:2]
+    ax.add_patch(Patch(outline, closed=True, facecolor="none", edgecolor=_PALE, lw=0.8, ls=":"))
+
+
 def draw_strip(result: Result, poses: int = 4) -> Figure:
     """The plan as strips of poses (as the paper's figs. 2 and 3): one row a phase, time running to the right."""
     courses = trajectory(result)

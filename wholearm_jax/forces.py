@@ -72,6 +72,9 @@ def arc(table: Table, seen: Window, duration, share, s, w, piece, row, moving) -
     d0, d1 = jnp.where(moving, w * width, 0.0)
     b0, b1 = jnp.where(moving, bend * width**2, 0.0)
     rise = s[1] - s[0]
+    # A step as short as the rounding of `s`, as across a tiny piece, would take its speed from that rounding.
+    even = (d0 + d1) / 2 + (b0 - b1) / 12
+    rise = jnp.where(jnp.abs(rise - even) < 8 * jnp.finfo(rise.dtype).eps * jnp.abs(s[1]), even, rise)
     quintic = [
         s[0],
         d0,

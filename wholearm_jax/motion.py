@@ -210,6 +210,7 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     share = jnp.where(rest, share, state.share)
     verdict = jnp.where(rest, verdict, int(Status.OK))
     waited = rest & (share > state.share)
+    room = how.max_steps - state.count - waited
     state = _append(state, waited, share, state.s, state.w, state.w, held=True)._replace(share=share)
     blocked = verdict != int(Status.OK)
 
@@ -223,9 +224,10 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     saved_times, saved = jnp.asarray(solution.ts), jnp.asarray(solution.ys)
     taken = solution.stats["num_accepted_steps"]
     overshot = dfx.is_event(solution.result)
-    complete = dfx.is_successful(solution.result) | overshot
+    # The record is as long as one stage may be; several stages together may need more.
+    complete = (dfx.is_successful(solution.result) | overshot) & (taken <= room)
     rows = jnp.arange(how.max_steps)
-    kept = jnp.where(overshot, taken - 1, taken)
+    kept = jnp.clip(jnp.where(overshot, taken - 1, taken), 0, jnp.maximum(room, 0))
     live = rows < kept
     # Unused rows are infinite: put numbers there before anything is computed from them.
     times = jnp.where(live, saved_times, state.share)
@@ -241,6 +243,7 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
         count=start + kept,
     )
     share, s, w = (nodes[start + kept, k] for k in range(3))
+    w = jnp.where(kept > 0, w, y0[1])  # a node at a chart's end holds the speed in the chart before
     last_time = jnp.where(overshot, saved_times[jnp.maximum(taken - 1, 0)], 1.0)
     last_y = jnp.where(overshot, saved[jnp.maximum(taken - 1, 0)], y0 * 0 + 1.0)
     passed = overshot & (last_y[0] > goal)
@@ -251,10 +254,11 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     factor = table.factor[jnp.minimum(state.piece + 1, table.factor.shape[0] - 1)]
     # `done` waits for the next stage where the object has come to rest: it may start again.
     status = jnp.select(
-        [blocked, ~complete, astray, passed & last, overshot],
+        [~complete, blocked, astray, passed & last, overshot],
         [
+            int(Status.MAX_STEPS),
             verdict,
-            *(int(s) for s in (Status.MAX_STEPS, Status.NO_CONVERGENCE, Status.LEFT_FORMATION, Status.MAX_STEPS)),
+            *(int(s) for s in (Status.NO_CONVERGENCE, Status.LEFT_FORMATION, Status.MAX_STEPS)),
         ],
         int(Status.OK),
     )

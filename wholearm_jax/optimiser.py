@@ -1,10 +1,12 @@
-"""Optimise: the torque schedule of a plan with the largest compressive margin, phase by phase.
+"""Optimise: the torque schedule of a plan with the largest compressive margin.
 
-Phases begin and end at rest, so each has its own problem. It starts from the quasi-static torques of an even
-rest-to-rest motion, descends (`descent`) while the temperature of the smooth margin falls, and keeps the best schedule
-whose honest simulation succeeds.
+Phases that begin and end at rest have each their own problem; those that follow one another at speed have one together.
+It starts from the quasi-static torques of a smooth motion, descends (`descent`) while the temperature of the smooth
+margin falls, and keeps the best schedule whose honest simulation succeeds.
 """
 
+import functools
+import itertools
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -16,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.descent import COLDEST, JOINED, Limits, advance, begin, interior_point, projected
+from wholearm_jax.descent import COLDEST, JOINED, Limits, advance, begin, interior_point, passed_on, projected
 from wholearm_jax.motion import Integration
 from wholearm_jax.plan import Result, Traced, describe, outcomes, require_x64, run, trace
 from wholearm_jax.reduction import blank
-from wholearm_jax.scene import Scene
+from wholearm_jax.scene import Phase, Scene
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.shooting import Variables
 from wholearm_jax.squeeze import Bound, bound, holds
@@ -31,6 +33,7 @@ TORQUE_SHARE = 0.9  # share of the torque limits that a start may use
 PROFILES = tuple((p, q) for p in (1.0, 2.0, 4.0, 8.0, 16.0) for q in (1.0, 2.0, 4.0, 8.0, 16.0))
 FINE = 8  # places a knot interval at which a starting motion is judged
 EVEN = 0.3  # share of the even motion in every profile, so that the object never quite stops on the way
+SPEEDS = (1.0, 0.4, 2.0)  # speeds at changes of formation to start from [wire lengths a duration]
 OTHERS = ((16.0, 1.0), (1.0, 1.0), (1.0, 16.0))  # further starts: a long dwell first, none, a long dwell last
 GOOD = 0.99  # share of the bound with which no further start is tried
 
@@ -79,15 +82,16 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
     """
     traced = traced or trace(scene)
     pairs = zip(traced, scene.phases, strict=True)
-    starts = [(at.table.torque_limit, _starts(at, p.duration, knots, 1.0)[0]) for at, p in pairs]
-    return _joined(scene, [limit * start.torque for limit, start in starts])
+    starts = [(p, at.table.torque_limit, _starts([at], [float(p.duration)], knots, 1.0)[0]) for at, p in pairs]
+    return _in_turn([_evenly(float(p.duration), limit * start.torque[0]) for p, limit, start in starts])
 
 
 def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...]:
     """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.bound`)."""
     traced = traced or trace(scene)
-    pairs = zip(traced, scene.phases, strict=True)
-    return tuple(_bound(at.table, p.duration, jnp.asarray(p.arrive == "rest")) for at, p in pairs)
+    begins = [True, *(p.arrive != "moving" for p in scene.phases[:-1])]
+    rows = zip(traced, scene.phases, begins, strict=True)
+    return tuple(_bound(at.table, p.duration, jnp.asarray(b), jnp.asarray(p.arrive == "rest")) for at, p, b in rows)
 
 
 def optimise(
@@ -103,97 +107,122 @@ def optimise(
 ) -> Optimised:
     """Find the torque schedule with the largest compressive margin by gradient descent through the simulation.
 
-    Every phase must arrive at rest; `knots` torques a joint, evenly spaced in time, are linear in between. The scene's
+    Each phase must arrive at its planned end in time, at rest or, where the next takes over, `moving`; `knots` torques
+    a joint and phase, evenly spaced in time, are linear in between. The scene's
     torque limits hold, and `rate_limit` [N m/s] if given. `durations = (shortest, longest)` lets each phase choose its
-    own. `optimiser` replaces the preconditioned descent by any optax optimiser, projected onto arrival. A phase stops
+    own. `optimiser` replaces the interior point by any optax optimiser (`descent.projected`). A phase stops
     when its margin comes within `tolerance` of the bound or no longer improves by that share, or after `steps`.
     `callback` sees every step. Where no torque can hold a formation, nothing is searched and the status says so.
     """
     require_x64()
-    method = _INTERIOR_POINT if optimiser is None else projected(optimiser)
+    joint = _groups(scene)
     with ThreadPoolExecutor(1) as beside:
-        ready = beside.submit(_compile, knots, method)
+        ready = [beside.submit(_compile, len(group), knots, _method(optimiser, len(group))) for group in joint]
         traced = trace(scene)
         tops = bounds(scene, traced=traced)
-        ready.result()
+        for one in ready:
+            one.result()
     found, history, stopped = [], [], []
-    for index, (at, top) in enumerate(zip(traced, tops, strict=True)):
-        phase = scene.phases[index]
-        pinned = found[-1].values[-1] if rate_limit is not None and found else None
-        task = _Task(index, at, float(top.value), float(top.share), phase.duration, knots, steps, tolerance, pinned)
-        limits = _limits(task, rate_limit, durations)
-        schedule, why, taken = _optimise_phase(task, limits, method, callback)
-        found.append(schedule)
-        stopped.append(why)
+    for group in joint:
+        parts = tuple(scene.phases[k] for k in group)
+        before = found[-1].values[-1] if rate_limit is not None and found else None
+        task = _Task(group[0], parts, [traced[k] for k in group], [tops[k] for k in group], knots, steps, tolerance)
+        limits = _limits(task, rate_limit, durations, before)
+        schedules, why, taken = _optimise_group(task, limits, before, _method(optimiser, len(group)), callback)
+        found += schedules
+        stopped += [why] * len(group)
         history += taken
     lengths = [f.times[-1] for f in found]
     phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, lengths, strict=True))
     scene = eqx.tree_at(lambda s: s.phases, scene, phases)
-    torque = _joined(scene, [f.values for f in found])
+    torque = _in_turn(found)
     result = describe(scene, torque, traced, outcomes(scene, torque, traced, Integration()))
     return Optimised(scene, torque, result, tops, tuple(stopped), tuple(history))
+
+
+def _groups(scene: Scene) -> list[list[int]]:
+    """Phases that follow one another at speed have one problem together."""
+    groups, fresh = [], True
+    for index, phase in enumerate(scene.phases):
+        groups = [*groups, [index]] if fresh else [*groups[:-1], [*groups[-1], index]]
+        fresh = phase.arrive != "moving"
+    return groups
 
 
 @dataclass(frozen=True)
 class _Task:
     index: int
-    traced: Traced
-    bound: float
-    bound_share: float
-    duration: jax.Array
+    phases: tuple[Phase, ...]
+    traced: list[Traced]
+    tops: list[Bound]
     knots: int
     steps: int
     tolerance: float
-    pinned: jax.Array | None
+
+    @property
+    def durations(self) -> np.ndarray:
+        return np.array([float(p.duration) for p in self.phases])
+
+    @property
+    def bounds(self) -> np.ndarray:
+        return np.array([float(top.value) for top in self.tops])
+
+    @property
+    def tables(self):
+        return jax.tree.map(lambda *a: jnp.stack(a), *(at.table for at in self.traced))
 
 
-def _optimise_phase(task: _Task, limits: Limits, method, callback) -> tuple[Torque, str, list[Step]]:
-    """Descend on one phase from one start after the other, until one comes near the bound or two agree; return the
-    best schedule (from time 0), why its descent stopped, and the steps taken."""
-    table = task.traced.table
-    if int(table.status) != Status.OK:
-        why = f"the wire cannot be followed: {Status(int(table.status)).label}"
-        return _evenly(task, np.zeros((task.knots, 2))), why, []
-    starts = _starts(task.traced, task.duration, task.knots, TORQUE_SHARE)
-    if task.bound <= 0:
-        why = f"no torque within limits holds this formation at {100 * task.bound_share:.0f} % of its wire"
-        return _evenly(task, starts[0].torque * table.torque_limit), why, []
-    best, best_key, reason, history = starts[0], (False, -np.inf), "", []
-    agree = False
+def _optimise_group(task: _Task, limits: Limits, before, method, callback) -> tuple[list[Torque], str, list[Step]]:
+    """Descend from one start after the other, until one comes near the bound or two agree.
+
+    Returns the best schedules (each from time 0), why their descent stopped, and the steps taken.
+    """
+    blank_values = np.zeros((task.knots, 2))
+    for at in task.traced:
+        if int(at.table.status) != Status.OK:
+            why = f"the wire cannot be followed: {Status(int(at.table.status)).label}"
+            return [_evenly(t, blank_values) for t in task.durations], why, []
+    starts = _starts(task.traced, task.durations, task.knots, TORQUE_SHARE)
+    best = starts[0]
+    weakest = int(np.argmin(task.bounds))
+    if task.bounds[weakest] <= 0:
+        where = 100 * float(task.tops[weakest].share)
+        why = f"no torque within limits holds this formation at {where:.0f} % of its wire"
+        return _schedules(task, best), why, []
+    best_key, reason, history = (False, -np.inf), "", []
     for number, start in enumerate(starts):
-        if task.pinned is not None:
-            start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[0].set(task.pinned / table.torque_limit))
+        if before is not None:
+            limit = task.traced[0].table.torque_limit
+            start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[0, 0].set(before / limit))
         p, why, taken = _descend(task, start, number, limits, method, callback)
         history += taken
-        margin, status = _honest(p, table)
-        key = (status is Status.OK, margin if np.isfinite(margin) else -np.inf)
-        agree = key[0] and best_key[0] and abs(key[1] - best_key[1]) <= task.tolerance * task.bound
+        key = _honest(task, p)
+        agree = key[0] and best_key[0] and abs(key[1] - best_key[1]) <= task.tolerance
         if key > best_key:
             best, best_key, reason = p, key, why
-        if agree or (best_key[0] and best_key[1] >= GOOD * task.bound):
+        if agree or (best_key[0] and best_key[1] >= GOOD):
             break
-    share = best_key[1] / task.bound
-    reason = f"within {task.tolerance:g} of the bound" if best_key[0] and share >= 1 - task.tolerance else reason
-    return _unpack(best, table)[0], reason, history
+    reached = best_key[0] and best_key[1] >= 1 - task.tolerance
+    return _schedules(task, best), f"within {task.tolerance:g} of the bound" if reached else reason, history
 
 
 def _descend(task: _Task, start: Variables, number: int, limits: Limits, method, callback):
     """One descent: the variables at its end, why it ended, and its steps."""
-    table, history = task.traced.table, []
+    tables, history = task.tables, []
     d = begin(start, method)
     why = f"the limit of {task.steps} steps"
     for count in range(task.steps):
         begun = time.perf_counter()
-        after = advance(d, table, limits, _HOW, method)
+        after = advance(d, tables, limits, _HOW, method)
         least, apart, hot, shares, share = jax.device_get(
             (after.least, after.apart, after.state.temperature, after.state.steps, after.share)
         )
-        margin = float(least) * task.bound
+        margin = float((least * task.bounds).min())
         step = Step(task.index, number, count, float(hot), margin, float(apart), time.perf_counter() - begun)
         history.append(step)
         if callback is not None:
             callback(step)
-        if apart < JOINED and hot <= COLDEST and (shares.min() >= 1 or margin >= (1 - task.tolerance) * task.bound):
+        if apart < JOINED and hot <= COLDEST and (shares.min() >= 1 or least.min() >= 1 - task.tolerance):
             return d.p, "the margin no longer improves", history
         if share < LOST:
             return d.p, "no step leads on", history
@@ -201,16 +230,24 @@ def _descend(task: _Task, start: Variables, number: int, limits: Limits, method,
     return d.p, why, history
 
 
-def _compile(knots: int, method) -> None:
-    """Compile the descent's programs, on a blank table, while the wires are being traced."""
-    if (knots, method) in _COMPILED:
+def _compile(phases: int, knots: int, method) -> None:
+    """Compile the descent's programs, on blank tables, while the wires are being traced."""
+    if (phases, knots, method) in _COMPILED:
         return
-    _COMPILED.add((knots, method))
-    table = blank(Resolution())
-    limits = Limits(*(jnp.asarray(a) for a in (np.full(2, np.inf), _ONE, _ONE, np.zeros(knots, bool), _ONE)))
-    p = Variables(*(jnp.asarray(a) for a in (np.zeros((knots, 2)), np.zeros((knots, 2)), np.zeros(()))))
-    advance(begin(p, method), table, limits, _HOW, method)
-    _honest(p, table)
+    _COMPILED.add((phases, knots, method))
+    tables = jax.tree.map(lambda a: jnp.stack([a] * phases), blank(Resolution()))
+    plain = (np.full(2, np.inf), _ONE, _ONE, np.zeros((phases, knots), bool), np.ones(phases))
+    limits = Limits(*(jnp.asarray(a) for a in plain))
+    empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
+    p = Variables(*(jnp.asarray(a) for a in empty))
+    advance(begin(p, method), tables, limits, _HOW, method)
+    run(blank(Resolution()), _padded(_evenly(1.0, empty[0][0])), jnp.zeros(()), jnp.ones(()), Integration(), True)
+
+
+@functools.cache
+def _method(optimiser, phases: int):
+    """One transformation for every use, so that programs are not compiled again."""
+    return interior_point(phases) if optimiser is None else projected(optimiser)
 
 
 _COMPILED: set = set()
@@ -219,46 +256,96 @@ _HOW = Integration()
 LOST = 1e-6  # share of a step at which a descent gives up
 
 
-def _evenly(task: _Task, values) -> Torque:
-    return Torque(jnp.asarray(np.linspace(0.0, float(task.duration), task.knots)), jnp.asarray(values))
+def _evenly(duration: float, values) -> Torque:
+    return Torque(jnp.asarray(np.linspace(0.0, float(duration), len(values))), jnp.asarray(values))
 
 
-@jax.jit
-def _unpack(p: Variables, table):
-    schedule = p.schedule(table)
-    return schedule, p.duration, padded(schedule)
+_padded = jax.jit(padded)
 
 
-def _honest(p: Variables, table) -> tuple[float, Status]:
-    _, duration, schedule = _unpack(p, table)
-    outcome = run(table, schedule, jnp.zeros(()), duration, Integration(), True)
-    return float(outcome.score.margin), Status(int(outcome.verdict.status))
+def _schedules(task: _Task, p: Variables) -> list[Torque]:
+    """Each phase's schedule, from time 0."""
+    limits = np.stack([np.asarray(at.table.torque_limit) for at in task.traced])
+    values, lengths = np.asarray(p.torque) * limits[:, None], np.exp(np.asarray(p.log_duration))
+    return [_evenly(length, rows) for length, rows in zip(lengths, values, strict=True)]
 
 
-def _starts(traced: Traced, duration, knots: int, share: float) -> list[Variables]:
-    """Rest-to-rest motions with the torques that give them, within a `share` of the limits, by the best squeeze.
+def _honest(task: _Task, p: Variables) -> tuple[bool, float]:
+    """Whether a simulation of the schedules says `ok`, and the least margin over its bound."""
+    start, shares, fine, arriving, end = jnp.zeros(()), [], [], None, 0.0
+    schedule = _padded(_in_turn(_schedules(task, p)))
+    for phase, at, length, top in zip(task.phases, task.traced, np.exp(p.log_duration), task.bounds, strict=True):
+        end = end + length
+        one = run(at.table, schedule, start, end - start, Integration(), phase.arrive == "rest", arriving)
+        start = start + one.duration * one.motion.share[one.motion.count]
+        arriving = one.leaving if phase.arrive == "moving" else None
+        fine.append(int(one.verdict.status) == Status.OK)
+        shares.append(float(one.score.margin) / top)
+    least = min(shares)
+    return all(fine), least if np.isfinite(least) else -np.inf
 
-    First that of `PROFILES` with the largest margin (the even one unless another gains more than 2 %), then `OTHERS`.
+
+def _starts(traced: list[Traced], durations, knots: int, share: float) -> list[Variables]:
+    """Motions with the torques that give them, within a `share` of the limits, by the best squeeze.
+
+    One phase goes from rest to rest: first that of `PROFILES` with the largest margin (the even one unless another
+    gains more than 2 %), then `OTHERS`. Several go through their changes of formation at each of `SPEEDS`.
     """
-    full = np.asarray(traced.table.torque_limit)
-    table = eqx.tree_at(lambda t: t.torque_limit, traced.table, jnp.asarray(share * full))
-    length, first, time = float(table.length), float(table.breaks[0]), float(duration)
-    u = np.linspace(0.0, 1.0, FINE * (knots - 1) + 1)
-    motions = [_profile(u, *powers) for powers in PROFILES]
+    if len(traced) == 1:
+        motions = [_profile(knots, *powers) for powers in PROFILES]
+        torque, margins = _squeezed(traced[0].table, durations[0], motions, share)
+        best = 0 if margins[0] >= margins.max() - 0.02 * abs(margins.max()) else int(np.argmax(margins))
+        order = [best, *(PROFILES.index(other) for other in OTHERS if PROFILES[best] != other)]
+        return [_variables([torque[k]], [motions[k]], durations) for k in order]
+    tables = [at.table for at in traced]
+    ratios = [float(_passed_on(*pair)) for pair in itertools.pairwise(tables)]
+    found = []
+    for speed in SPEEDS:
+        entry, motions, torques = 0.0, [], []
+        for k, (table, length) in enumerate(zip(tables, durations, strict=True)):
+            leave = 0.0 if k == len(tables) - 1 else speed
+            motions.append(_between(knots, entry, leave))
+            torques.append(_squeezed(table, length, motions[-1:], share)[0][0])
+            if k < len(tables) - 1:
+                entry = ratios[k] * leave * float(table.length) / length
+                entry = float(np.clip(entry * durations[k + 1] / float(tables[k + 1].length), 0.0, 2.9))
+        found.append(_variables(torques, motions, durations))
+    return found
+
+
+def _squeezed(table, time: float, motions, share: float):
+    """Torques at the knots, in units of their limits, and least forces [N] of motions given FINE places an interval."""
+    full = np.asarray(table.torque_limit)
+    tight = eqx.tree_at(lambda t: t.torque_limit, table, jnp.asarray(share * full))
+    length, first = float(table.length), float(table.breaks[0])
     s, v, a = (np.stack(rows) for rows in zip(*motions, strict=True))
-    held = _holds(table, first + length * s, length * v / time, length * a / time**2)
-    margins = np.asarray(held.margin).min(1)
-    best = 0 if margins[0] >= margins.max() - 0.02 * abs(margins.max()) else int(np.argmax(margins))
-    order = [best, *(PROFILES.index(other) for other in OTHERS if PROFILES[best] != other)]
-    torque = np.clip(np.asarray(held.torque)[:, ::FINE] / full, -share, share)
-    state = np.stack([s, v], axis=2)[:, ::FINE]
-    state[:, -1] = (1.0, 0.0)
-    log = jnp.asarray(np.log(time))
-    return [Variables(jnp.asarray(torque[k]), jnp.asarray(state[k]), log) for k in order]
+    held = _holds(tight, first + length * s, length * v / time, length * a / time**2)
+    return np.clip(np.asarray(held.torque)[:, ::FINE] / full, -share, share), np.asarray(held.margin).min(1)
 
 
-def _profile(u, p, q):
+def _variables(torques, motions, durations) -> Variables:
+    state = np.stack([np.stack(motion[:2], axis=1)[::FINE] for motion in motions])
+    state[:, 0, 0], state[:, -1, 0], state[-1, -1, 1] = 0.0, 1.0, 0.0
+    return Variables(jnp.asarray(np.stack(torques)), jnp.asarray(state), jnp.asarray(np.log(durations)))
+
+
+def _in_turn(schedules: list[Torque]) -> Torque:
+    """Schedules one after the other; a step where one follows another."""
+    begins = np.cumsum([0.0, *(float(s.times[-1]) for s in schedules[:-1])])
+    times = [begin + np.asarray(s.times) for begin, s in zip(begins, schedules, strict=True)]
+    return Torque(jnp.asarray(np.concatenate(times)), jnp.concatenate([s.values for s in schedules]))
+
+
+def _between(knots: int, entry: float, leave: float):
+    """Motion over a unit length and time with given speeds at its ends: a cubic."""
+    u = np.linspace(0.0, 1.0, FINE * (knots - 1) + 1)
+    s = np.polynomial.Polynomial([0.0, entry, 3 - 2 * entry - leave, entry + leave - 2])
+    return s(u), s.deriv(1)(u), s.deriv(2)(u)
+
+
+def _profile(knots: int, p: float, q: float):
     """Motion over a unit length and time from rest to rest, `EVEN` even and the rest with speed `v ~ u^p (1 - u)^q`."""
+    u = np.linspace(0.0, 1.0, FINE * (knots - 1) + 1)
     inner = np.clip(u, 1e-12, 1 - 1e-12)
     v = inner**p * (1 - inner) ** q
     a = v * (p / inner - q / (1 - inner))
@@ -272,27 +359,22 @@ def _profile(u, p, q):
 
 
 _holds = jax.jit(jax.vmap(holds, (None, 0, 0, 0)))
-_INTERIOR_POINT = interior_point()
 _bound = jax.jit(bound)
 
 
-def _limits(task: _Task, rate_limit, durations) -> Limits:
-    shortest, longest = durations or (float(task.duration), float(task.duration))
+@jax.jit
+def _passed_on(before, after):
+    return passed_on(*(jax.tree.map(lambda a: a[None], table) for table in (before, after)))[0]
+
+
+def _limits(task: _Task, rate_limit, durations, before) -> Limits:
+    lengths = task.durations
+    shortest, longest = durations or (lengths.min(), lengths.min())
     rate = np.full(2, np.inf if rate_limit is None else float(rate_limit))
-    pinned = np.zeros(task.knots, bool)
-    pinned[0] = task.pinned is not None
-    unit = max(task.bound, 1e-300)
-    return Limits(*(jnp.asarray(a) for a in (rate, shortest * _ONE, longest * _ONE, pinned, unit * _ONE)))
-
-
-def _joined(scene: Scene, blocks) -> Torque:
-    """Knots of each phase as one schedule; a step where one phase follows another."""
-    start, times = 0.0, []
-    for phase, block in zip(scene.phases, blocks, strict=True):
-        end = start + float(phase.duration)
-        times.append(np.linspace(start, end, block.shape[0]))
-        start = end
-    return Torque(jnp.asarray(np.concatenate(times)), jnp.asarray(np.concatenate([np.asarray(b) for b in blocks])))
+    pinned = np.zeros((len(lengths), task.knots), bool)
+    pinned[0, 0] = before is not None
+    unit = np.maximum(task.bounds, 1e-300)
+    return Limits(*(jnp.asarray(a) for a in (rate, shortest * _ONE, longest * _ONE, pinned, unit)))
 
 
 def replace_duration(phase, duration):

@@ -1,7 +1,9 @@
 """Plans: trace and simulate a scene's phases one after the other, and say what became of them.
 
-Each phase starts at rest where the wire of the phase before it ended. Two compiled programs serve every phase of every
-scene: `prepare` (trace and reduce) and `run` (simulate, score, judge).
+Each phase starts where the wire of the phase before it ended: at rest, or, where that phase arrives `moving`, with the
+speed that the impact leaves (`reduction.change`), at the moment when the formation changes. It has time until its
+planned end. Two compiled programs serve every phase of every scene: `prepare` (trace and reduce) and `run` (simulate,
+score, judge).
 """
 
 from dataclasses import dataclass
@@ -15,7 +17,7 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.forces import Score, arcs, force, on_arc, score
 from wholearm_jax.motion import Integration, Motion, move
-from wholearm_jax.reduction import Table, horner, powers, reduce_wire
+from wholearm_jax.reduction import Change, Table, change, horner, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, body, contact_name
 from wholearm_jax.schedule import Torque, has_steps, padded, window
 from wholearm_jax.status import Status
@@ -35,21 +37,29 @@ class Traced(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """A simulated phase as arrays."""
+    """A simulated phase as arrays: when it begins and how long it may take [s], the change of formation by which it is
+    entered, what happens, and `z_dot` (SI) at its end."""
 
+    start: Float[Array, ""]
+    duration: Float[Array, ""]
+    entered: Change
     motion: Motion
     score: Score
     verdict: Verdict
+    leaving: Float[Array, "5"]
 
 
 @dataclass(frozen=True)
 class PhaseResult:
     """A simulated phase, readable: times in seconds from the plan's start, contacts by name, forces in newtons.
 
+    `time` is when the phase ended or failed. A phase that is entered while moving begins at `start` with `impulses`
+    [N s], one a contact.
     `slips` says that the contact lost is one that should roll, and that it leaves its friction cone.
     """
 
     name: str
+    arrive: str
     contacts: tuple[str, ...]
     status: Status
     time: float
@@ -61,6 +71,7 @@ class PhaseResult:
     margin_time: float
     margin_s: float
     margin_contact: str
+    impulses: tuple[float, ...]
     traced: Traced
     outcome: Outcome
 
@@ -106,13 +117,26 @@ def prepare(scene_body, hand, gravity, formation, rough, heading, resolution: Re
     return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), Traced(wire, reduce_wire(mechanics, wire)))
 
 
+def run(table: Table, schedule: Torque, start, duration, how: Integration, at_rest: bool, arriving=None) -> Outcome:
+    """Simulate one phase from its wire's start, score it and judge it.
+
+    `arriving` is `z_dot` (SI) at the end of the phase before, for a change of formation while moving (None: at rest).
+    """
+    arriving = jnp.zeros(5, table.breaks.dtype) if arriving is None else arriving
+    return _run(table, schedule, start, duration, arriving, how, at_rest)
+
+
 @eqx.filter_jit
-def run(table: Table, schedule: Torque, start, duration, how: Integration, at_rest: bool) -> Outcome:
-    """Simulate one phase from rest at its wire's start, score it and judge it."""
+def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, at_rest: bool) -> Outcome:
     seen = window(schedule, start, duration)
-    motion = move(table, seen, duration, how=how)
+    entered = change(table, arriving)
+    motion = move(table, seen, duration, how=how, speed=jnp.maximum(entered.speed, 0.0))
     scored = score(table, seen, duration, motion, how)
-    return Outcome(motion, scored, judge(table, motion, scored, at_rest))
+    verdict = judge(table, motion, scored, at_rest, entered)
+    last = jnp.maximum(motion.count - 1, 0)
+    panel, xi = powers(table, motion.piece[last], motion.s[motion.count])
+    leaving = horner(table.velocity[panel], xi) * motion.w[motion.count] / duration
+    return Outcome(start, duration, entered, motion, scored, verdict, leaving)
 
 
 _body, _padded = jax.jit(body), jax.jit(padded)
@@ -180,10 +204,16 @@ def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, toleranc
 
 def outcomes(scene: Scene, torque: Torque, traced: tuple[Traced, ...], how: Integration) -> tuple[Outcome, ...]:
     """Simulate every phase; differentiable, and usable under any JAX transformation."""
-    schedule, start, found = _padded(torque), jnp.zeros((), torque.times.dtype), []
+    zero = jnp.zeros((), torque.times.dtype)
+    schedule, start, planned, still, found = _padded(torque), zero, zero, jnp.zeros(5, zero.dtype), []
+    arriving = still
     for phase, at in zip(scene.phases, traced, strict=True):
-        found.append(run(at.table, schedule, start, phase.duration, how, phase.arrive == "rest"))
-        start = start + phase.duration
+        planned = planned + phase.duration
+        one = run(at.table, schedule, start, planned - start, how, phase.arrive == "rest", arriving)
+        found.append(one)
+        flying = phase.arrive == "moving"
+        start = start + one.duration * one.motion.share[one.motion.count] if flying else planned
+        arriving = one.leaving if flying else still
     return tuple(found)
 
 
@@ -223,7 +253,7 @@ def simulate(
     traced = traced or trace(scene)
     stepped = any(has_steps(torque, start, end) for start, end in _spans(scene))
     while True:
-        how = Integration(tolerance=tolerance, max_steps=max_steps, steps=stepped)
+        how = Integration(tolerance=tolerance, max_steps=max_steps, stages=max(8, max_steps // 32), steps=stepped)
         found = outcomes(scene, torque, traced, how)
         short = any(int(o.verdict.status) == Status.MAX_STEPS for o in found)
         if not short or max_steps >= 16384:
@@ -234,14 +264,15 @@ def simulate(
 def describe(scene: Scene, torque: Torque, traced, found) -> Result:
     """Arrays as a readable result."""
     rows = []
-    for phase, (start, _), at, outcome in zip(scene.phases, _spans(scene), traced, found, strict=True):
-        names, length = phase.formation.names, float(phase.duration)
+    for phase, at, outcome in zip(scene.phases, traced, found, strict=True):
+        names, start, length = phase.formation.names, float(outcome.start), float(outcome.duration)
         verdict, scored = outcome.verdict, outcome.score
         slot, of_slot = int(verdict.contact), phase.formation.contact_of_slot
         known = bool(np.isfinite(scored.margin)) and int(at.table.status) == Status.OK
         rows.append(
             PhaseResult(
                 name=phase.name,
+                arrive=phase.arrive,
                 contacts=names,
                 status=Status(int(verdict.status)),
                 time=start + length * float(verdict.share),
@@ -253,6 +284,7 @@ def describe(scene: Scene, torque: Torque, traced, found) -> Result:
                 margin_time=start + length * float(scored.share),
                 margin_s=float(scored.s),
                 margin_contact=names[of_slot[int(scored.contact)]],
+                impulses=tuple(float(outcome.entered.impulse[k]) for k in phase.formation.normal_slots),
                 traced=at,
                 outcome=outcome,
             )
@@ -331,7 +363,8 @@ def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
     for phase in result.phases:
         if int(phase.traced.table.status) != Status.OK:
             break
-        stop = 1.0 if phase.status is Status.OK else (phase.time - phase.start) / phase.duration
+        left = phase.arrive == "moving" or phase.status is not Status.OK
+        stop = (phase.time - phase.start) / phase.duration if left else 1.0
         shares = jnp.linspace(0.0, stop, samples)
         start, duration = jnp.asarray(phase.start), jnp.asarray(phase.duration)
         found.append(sample(phase.traced.table, schedule, start, duration, phase.outcome.motion, shares))

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.contacts import constraint_curvature, constraint_rows, slip_rows
@@ -27,11 +28,14 @@ TERMS = 5  # 1, v^2, v, tau1, tau2
 class Table(eqx.Module):
     """A reduced wire: polynomials in the panel coordinate `xi` in [-1, 1], lowest power first, SI units.
 
-    `acceleration[p, k]` are the coefficients of `a = ds^2/dt^2` in `(1, v^2, v, tau1, tau2)`, `backward[p, k]` those in
-    `(1, tau1, tau2)` for travel the other way at rest, `force[p, k, i]` those of the force in constraint `i` [N]:
-    `c_n`, or `c_t` where `tangential` (a contact that rolls), with `grip` its friction coefficient (0 elsewhere).
-    `configuration[p, k]` are those of `z`, `velocity[p, k]` those of `dz/ds`. `tension[piece, i]` is `c_t / c_n`
-    (eq. 3) where a contact slides.
+    `acceleration[p, k]` are the coefficients of `a = ds^2/dt^2` in `(1, v^2, v, tau1, tau2)`, `force[p, k, i]` those of
+    the force in constraint `i` [N]: `c_n`, or `c_t` where `tangential` (a contact that rolls), with `grip` its friction
+    coefficient (0 elsewhere). `configuration[p, k]` are those of `z`, `velocity[p, k]` those of `dz/ds`.
+    `backward[p, k]` are those of `a` in `(1, tau1, tau2)` for travel the other way at rest, times the square of the 5x5
+    determinant (against that without friction): the same sign, and smooth where friction would wedge the object on its
+    way back. `tension[piece, i]` is `c_t / c_n` (eq. 3) where a contact slides.
+    `entry` serves an object that arrives with `z_dot` from another formation: its rows times `z_dot` are `ds/dt` after
+    the inelastic impact and the contacts' impulses [N s] (see `change`).
     `error` is the largest interpolation error, relative to each function's own size; `condition` the largest
     condition number of the 5x5 matrix, at `condition_s`.
     """
@@ -49,6 +53,7 @@ class Table(eqx.Module):
     tension: Float[Array, "pieces slots"]
     tangential: Bool[Array, "slots"]
     grip: Float[Array, "slots"]
+    entry: Float[Array, "5 5"]
     torque_limit: Float[Array, "2"]
     error: Float[Array, ""]
     condition: Float[Array, ""]
@@ -58,7 +63,7 @@ class Table(eqx.Module):
     @property
     def length(self) -> Float[Array, ""]:
         """The wire's extent in `s`."""
-        return self.breaks[-1] - self.breaks[0]
+        return self.breaks[..., -1] - self.breaks[..., 0]
 
 
 def balance(system: System, z, x, bend, slip_sign, joint_sign):
@@ -87,9 +92,11 @@ def along_wire(system: System, z, u):
 
 
 def reduce_wire(system: System, wire: Wire) -> Table:
-    """Solve the 5x5 system at every node of a wire and tabulate."""
-    chart = wire.chart[wire.owner]
-    xi, turn = wire.slip_sign[wire.owner], wire.joint_sign[wire.owner]
+    """Solve the 5x5 system at every node of a wire, and at its start for those who enter with speed; tabulate."""
+    shape = wire.nodes.shape[:2]
+    place = jnp.concatenate([wire.nodes.reshape(-1, 5), wire.start[None]])
+    owner = jnp.append(jnp.repeat(wire.owner, shape[1]), 0)
+    chart, xi, turn = wire.chart[owner], wire.slip_sign[owner], wire.joint_sign[owner]
 
     def node(z, u, slip_sign, joint_sign):
         x, bend = along_wire(system, z, u)
@@ -100,12 +107,14 @@ def reduce_wire(system: System, wire: Wire) -> Table:
         solution = inverse @ right
         behind = jnp.linalg.solve(back, resting[:, jnp.array([0, 3, 4])])
         # Friction may turn the determinant's sign only by passing through a singular matrix.
-        upright = jnp.linalg.det(matrix) * jnp.linalg.det(smooth)
+        with_friction, without, turned = jnp.linalg.det(stop_gradient(jnp.stack([matrix, smooth, back])))
+        upright = with_friction * without
         condition = jnp.abs(matrix).sum(0).max() * jnp.abs(inverse).sum(0).max()
-        return x, solution[0], solution[1:], behind[0], condition, upright
+        entry = inverse * system.inertia
+        return entry, (x, solution[0], solution[1:], behind[0] * (turned / without) ** 2, condition, upright)
 
-    over_nodes = jax.vmap(node, (0, None, None, None))
-    x, ahead, force, behind, condition, upright = jax.vmap(over_nodes)(wire.nodes, chart, xi, turn)
+    entry, found = jax.vmap(node)(place, chart, xi, turn)
+    x, ahead, force, behind, condition, upright = (a[:-1].reshape(*shape, *a.shape[1:]) for a in found)
 
     torque, newtons = system.torque_unit, system.force_unit
     per_term = jnp.stack([jnp.ones_like(torque), jnp.ones_like(torque), jnp.ones_like(torque), 1 / torque, 1 / torque])
@@ -133,6 +142,7 @@ def reduce_wire(system: System, wire: Wire) -> Table:
         tension=-system.contacts.friction * wire.slip_sign,
         tangential=system.contacts.tangential,
         grip=jnp.where(system.contacts.tangential, system.contacts.friction, 0.0),
+        entry=entry[-1] * jnp.append(1.0, jnp.full(4, newtons))[:, None] / unit,
         torque_limit=system.torque_limit,
         error=error,
         condition=worst,
@@ -150,9 +160,30 @@ def blank(resolution: Resolution, contacts: int = 4) -> Table:
     each |= {"force": np.zeros((panels, nodes, contacts, TERMS)), "tension": np.zeros((pieces, contacts))}
     each |= {"breaks": np.arange(pieces + 1.0), "factor": np.ones(pieces), "torque_limit": np.ones(2)}
     each |= {"tangential": np.zeros(contacts, bool), "grip": np.zeros(contacts)}
-    each |= {"first": np.zeros(pieces, int), "panels": np.ones(pieces, int)}
+    each |= {"entry": np.zeros((5, 5)), "first": np.zeros(pieces, int), "panels": np.ones(pieces, int)}
     filled = {name: jnp.asarray(value) for name, value in each.items()}
     return Table(count=whole + 1, error=zero, condition=zero, condition_s=zero, status=whole, **filled)
+
+
+class Change(eqx.Module):
+    """Entering a formation with speed: `ds/dt` [1/s] after the impact and the contacts' impulses [N s]."""
+
+    speed: Float[Array, ""]
+    impulse: Float[Array, "slots"]
+
+
+def change(table: Table, z_dot: Float[Array, "5"]) -> Change:
+    """The inelastic impact by which a formation takes over from another that moves with `z_dot` (SI).
+
+    Velocities after it are the new wire's, `x v`; impulses `p` obey the friction of forward travel:
+
+        [ M x , -(G_n - Xi U G_t)^T ] [v ; p] = M z_dot_minus
+
+    the 5x5 system of the equations of motion with momenta in place of forces. Kinetic energy never grows: with
+    `z_dot_plus = x v` and compressive `p`, what is lost is that of `z_dot_plus - z_dot_minus` and the work of friction.
+    """
+    after = table.entry @ z_dot
+    return Change(after[0], after[1:])
 
 
 def powers(table: Table, piece: Int[Array, ""], s: Float[Array, ""]) -> tuple[Int[Array, ""], Float[Array, ""]]:
@@ -183,7 +214,7 @@ def _tail(values):
 
     Functions a hundred thousand times smaller than their largest companion are judged against that.
     """
-    coefficients = jnp.einsum("kn,pn...->pk...", _TO_CHEBYSHEV[values.shape[1]], jax.lax.stop_gradient(values))
+    coefficients = jnp.einsum("kn,pn...->pk...", _TO_CHEBYSHEV[values.shape[1]], stop_gradient(values))
     tail = jnp.abs(coefficients[:, -2:]).sum(1).max(0)
     size = jnp.abs(values).max((0, 1))
     return (tail / jnp.maximum(size, 1e-5 * size.max() + 1e-300)).max()

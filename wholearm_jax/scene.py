@@ -84,6 +84,11 @@ class Formation(eqx.Module):
         return tuple(contact_name(*row[:3], rolling=row[3]) for row in rows if not row[4])
 
     @property
+    def normal_slots(self) -> tuple[int, ...]:
+        """The row of each contact's gap."""
+        return tuple(np.flatnonzero(~np.asarray(self.tangential)).tolist())
+
+    @property
     def contact_of_slot(self) -> tuple[int, ...]:
         """Which of `names` each row belongs to."""
         return tuple((np.cumsum(~np.asarray(self.tangential)) - 1).tolist())
@@ -105,7 +110,8 @@ class Heading(eqx.Module):
 class Phase(eqx.Module):
     """One contact formation held for a while.
 
-    `arrive` is `"rest"` (the object must be at rest at the end) or `"moving"` (any speed will do).
+    `arrive` is `"rest"` (the object must be at rest at the end), `"moving"` (the next phase takes over at speed, by an
+    inelastic impact) or `"caught"` (any speed will do, and is lost before the next phase).
     """
 
     name: str = eqx.field(static=True)

@@ -168,7 +168,7 @@ class _Phase(_Strict):
     toward: Annotated[str, AfterValidator(_signed_coordinate)]
     duration: Positive
     until: Annotated[dict[Coordinate, Finite], AfterValidator(_one_coordinate)] | None = None
-    arrive: Literal["rest", "moving"] = "rest"
+    arrive: Literal["rest", "moving", "caught"] = "rest"
 
 
 class _Scene(_Strict):

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 from wholearm_jax.forces import MOST_ROLLING, Arcs, arc, linear_slacks, sampled_slacks
 from wholearm_jax.motion import Integration, acceleration, single_step
 from wholearm_jax.reduction import Table
-from wholearm_jax.schedule import Torque, Window
+from wholearm_jax.schedule import Window
 
 STEPS = 2  # solver steps an interval (and a part of it, where it is cut)
 ROWS = 4 + MOST_ROLLING  # slacks a sample
@@ -36,22 +36,13 @@ LANDED = 1e-8  # size of the last one; what is left is taken to first order, an 
 
 
 class Variables(eqx.Module):
-    """What is optimised: torques at the knots in units of their limits, states `(s, v)` at the knots in wire lengths
-    from the wire's start and wire lengths a duration, and the logarithm of the duration [s]."""
+    """What is optimised, for one phase or several that follow one another at speed: torques at the knots in units of
+    their limits, states `(s, v)` at the knots in wire lengths from the wire's start and wire lengths a duration, and
+    the logarithms of the durations [s]."""
 
-    torque: Float[Array, "knots 2"]
-    state: Float[Array, "knots 2"]
-    log_duration: Float[Array, ""]
-
-    def schedule(self, table: Table) -> Torque:
-        """The torque schedule, from time 0."""
-        knots = self.torque.shape[0]
-        return Torque(jnp.linspace(0.0, 1.0, knots) * self.duration, self.torque * table.torque_limit)
-
-    @property
-    def duration(self) -> Float[Array, ""]:
-        """Seconds."""
-        return jnp.exp(self.log_duration)
+    torque: Float[Array, "phases knots 2"]
+    state: Float[Array, "phases knots 2"]
+    log_duration: Float[Array, "phases"]
 
 
 class Shot(NamedTuple):
@@ -65,10 +56,10 @@ class Shot(NamedTuple):
     end: Float[Array, "*intervals 2"]
 
 
-def local(p: Variables) -> Float[Array, "intervals 7"]:
+def local(p: Variables) -> Float[Array, "phases intervals 7"]:
     """What each interval depends on: `s`, `v`, two torques at either end, log of the duration."""
-    spread = jnp.broadcast_to(p.log_duration, (p.torque.shape[0] - 1, 1))
-    return jnp.concatenate([p.state[:-1], p.torque[:-1], p.torque[1:], spread], axis=1)
+    spread = jnp.broadcast_to(p.log_duration[:, None, None], (*p.torque[:, 1:].shape[:2], 1))
+    return jnp.concatenate([p.state[:, :-1], p.torque[:, :-1], p.torque[:, 1:], spread], axis=2)
 
 
 class _Parts(NamedTuple):

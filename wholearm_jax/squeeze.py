@@ -79,8 +79,8 @@ def holds(table: Table, s, v, a) -> Hold:
     return jax.vmap(hold, (None, 0, 0, 0))(table, s, v, a)
 
 
-def bound(table: Table, duration: Float[Array, ""], at_rest: bool = True) -> Bound:
-    """An upper bound on the margin of a phase along a wire that starts, and with `at_rest` ends, at rest.
+def bound(table: Table, duration: Float[Array, ""], from_rest=True, to_rest=True) -> Bound:
+    """An upper bound on the margin of a phase along a wire that starts, and ends, at rest or moving.
 
     At each of many places the least slack is maximised over torques within limits and over speeds up to `FASTEST` wire
     lengths a duration (each interval of speeds by its most favourable corner, so that the bound errs upward); at rest
@@ -107,8 +107,8 @@ def bound(table: Table, duration: Float[Array, ""], at_rest: bool = True) -> Bou
         return _best(table, force[:, 0], force[:, 3:], sign * motion[3:], sign * motion[0])
 
     values = jax.vmap(moving)(places)
-    values = values.at[0].set(resting(places[0], 1.0))
-    values = jnp.where(at_rest, values.at[-1].set(resting(places[-1], -1.0)), values)
+    values = jnp.where(from_rest, values.at[0].set(resting(places[0], 1.0)), values)
+    values = jnp.where(to_rest, values.at[-1].set(resting(places[-1], -1.0)), values)
     k = jnp.argmin(values)
     return Bound(values[k], places[k], k / PLACES)
 

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.forces import Score
+from wholearm_jax.forces import Score, slack
 from wholearm_jax.motion import Motion
-from wholearm_jax.reduction import Table
+from wholearm_jax.reduction import Change, Table
 from wholearm_jax.status import Status
 
 ARRIVAL = 1e-6  # of the wire's length: how near its end a phase that arrives at rest must come
@@ -16,6 +16,8 @@ ARRIVAL_SPEED = math.sqrt(12 * ARRIVAL)
 """Speed left at arrival, in wire lengths a duration: what braking at 6 lengths a duration squared (the even
 rest-to-rest motion) ends within `ARRIVAL` of a length. Nearer to the end time and position do not fix the speed better
 than this square root."""
+
+PULL = 1e-9  # share of the largest impulse by which one may be negative for rounding
 
 
 class Verdict(eqx.Module):
@@ -26,10 +28,11 @@ class Verdict(eqx.Module):
     contact: Int[Array, ""]
 
 
-def judge(table: Table, motion: Motion, score: Score, at_rest: bool) -> Verdict:
+def judge(table: Table, motion: Motion, score: Score, at_rest: bool, entered: Change) -> Verdict:
     """Decide the status of a phase that must end at rest (`at_rest`) or may end moving.
 
-    The earliest trouble counts: a wire that cannot be traced, a tensile force, then how the motion ended.
+    The earliest trouble counts: a wire that cannot be traced, an impulse that would pull (or throw the object back)
+    where the phase is entered with speed, a tensile force, then how the motion ended.
     """
     share, s, w = (values[motion.count] for values in (motion.share, motion.s, motion.w))
     near = jnp.abs(table.breaks[-1] - s) <= ARRIVAL * table.length
@@ -45,8 +48,14 @@ def judge(table: Table, motion: Motion, score: Score, at_rest: bool) -> Verdict:
     lost = jnp.isfinite(score.lost)
     status = jnp.where(lost, int(Status.CONTACT_LOST), finish)
     traced = table.status == 0
+    room = slack(table, entered.impulse)  # impulses have the cones of forces
+    pulls = room.min() < -PULL * jnp.abs(entered.impulse).max()
+    back = entered.speed < 0
+    refused = pulls | back
+    early = jnp.where(pulls, int(Status.CONTACT_LOST), int(Status.REVERSED))
+    contact = jnp.where(pulls, jnp.argmin(room), jnp.where(lost & ~back, score.lost_contact, -1))
     return Verdict(
-        status=jnp.where(traced, status, table.status),
-        share=jnp.where(traced, jnp.where(lost, score.lost, share), 0.0),
-        contact=jnp.where(traced & lost, score.lost_contact, -1),
+        status=jnp.where(traced, jnp.where(refused, early, status), table.status),
+        share=jnp.where(traced & ~refused, jnp.where(lost, score.lost, share), 0.0),
+        contact=jnp.where(traced, contact, -1),
     )

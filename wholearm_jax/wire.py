@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.contacts import constraint_rows, constraints, frame, frames, placed, slips
 from wholearm_jax.newton import newton
@@ -102,6 +102,7 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
             _misplaced(fixed, stop_gradient(start)),
             ~direction,
             march.status > 0,
+            places.branched,
             places.failed | wire.status.astype(bool),
         ],
         [
@@ -109,6 +110,7 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
             int(Status.LEFT_FORMATION),
             int(Status.SINGULAR),
             march.status,
+            int(Status.SINGULAR),
             int(Status.NO_CONVERGENCE),
         ],
         0,
@@ -330,7 +332,8 @@ class _Places(NamedTuple):
     chart: Int[Array, "places"]
     end: Float[Array, "5"]
     end_s: Float[Array, ""]
-    failed: Float[Array, ""]
+    branched: Bool[Array, ""]
+    failed: Bool[Array, ""]
 
 
 _PLANE, _END = 6, 7  # fifth equations: 0-3 slip of a contact, 4-5 speed of a joint, then these
@@ -377,7 +380,10 @@ def _places(system, heading, march, resolution):
     guess = jnp.where(used[:, None], guess, march.z[0]).at[-1].set(march.end_z)
     what = jnp.where(used, what, _PLANE)
 
-    def locate(segment, what, guess):
+    # A chart ends at the node before the first step in the next one.
+    chart = march.chart[jnp.maximum(segment - (what == _PLANE), 0)]
+
+    def locate(segment, what, guess, chart):
         hint = march.x[jnp.maximum(segment - 1, 0)]
 
         def equations(z, system, heading):
@@ -385,15 +391,32 @@ def _places(system, heading, march, resolution):
             return jnp.concatenate([constraints(system.contacts, z), fifth[None]])
 
         root = newton(equations, guess, system, heading)
-        return root.z, root.residual, _coordinate(march, march.chart[segment], root.z)
+        return root.z, root.residual, _coordinate(march, chart, root.z)
 
-    z, residual, s = jax.vmap(locate)(segment, what, guess)
+    z, residual, s = jax.vmap(locate)(segment, what, guess, chart)
     slack = jnp.where(what == _END, 4 * SHORTEST, 1e-6)
     astray = (residual > 1e-8) | (s < before[segment] - slack) | (s > march.s[segment] + slack)
     failed = jnp.any(used & astray)
     kinks = jnp.where(used[:-1], s[:-1], jnp.inf)
     rank = jnp.argsort(stop_gradient(kinks))
-    return _Places(z[rank], kinks[rank], march.chart[segment[rank]], z[-1], s[-1], failed)
+    branched = _branches(fixed, march, stop_gradient(z[-1]), astray[-1])
+    return _Places(z[rank], kinks[rank], chart[rank], z[-1], s[-1], branched, failed)
+
+
+def _branches(system, march, end, astray):
+    """Whether the wire meets another one on its way: `det [G_n; x]`, the product of singular values, changes sign."""
+
+    def orientation(z, x):
+        return jnp.linalg.det(jnp.concatenate([constraint_rows(system.contacts, z), x[None]]))
+
+    rows, last = jnp.arange(MAX_MARCH), jnp.maximum(march.n - 1, 0)
+    along = jax.vmap(orientation)(march.z, march.x)
+    # The last node lies a little beyond the end: it counts only if the end was not found.
+    at_end = orientation(end, march.x[jnp.maximum(last - 1, 0)])
+    along = jnp.where((rows == last) & ~astray, at_end, along)
+    live = (rows < march.n) & (rows > 0) & (march.end >= 0)
+    size = jnp.abs(jnp.where(live, along, along[0])).max()
+    return jnp.any(live & (along * jnp.sign(along[0]) < jnp.sqrt(jnp.finfo(end.dtype).eps) * size))
 
 
 def _flips(values, live):
@@ -421,19 +444,26 @@ def _cut(system, fixed, march, places, start, resolution):
     """Lay panels over the pieces and solve the C-functions at every node."""
     inside = jnp.isfinite(places.s) & (stop_gradient(places.s) < stop_gradient(places.end_s))
     count = inside.sum() + 1
-    end_s = places.end_s
-    start_s = _coordinate(march, 0, start)
-    kinks = jnp.where(inside, jnp.where(inside, places.s, 0.0), end_s)
-    breaks = jnp.concatenate([start_s[None], kinks, end_s[None]])
     last = march.chart[jnp.maximum(march.n - 1, 0)]
     # Piece k ends at place k, which lies in the chart of the segment before it.
-    owner_chart = jnp.concatenate([jnp.where(inside, places.chart, last), last[None]])
-    chart, anchor, anchor_s = march.charts[owner_chart], march.anchors[owner_chart], march.anchor_s[owner_chart]
-
+    owner_chart = jnp.append(jnp.where(inside, places.chart, last), last)
+    chart, anchor = march.charts[owner_chart], march.anchors[owner_chart]
     entry = jnp.concatenate([start[None], places.z])
-    before = jnp.concatenate([chart[:1], chart[:-1]])
-    x_entry = jax.vmap(lambda z, u: tangent(system, z, u))(entry, before)
-    factor = jnp.where(jnp.arange(resolution.pieces) < count, (chart * x_entry).sum(1) / (before * x_entry).sum(1), 1.0)
+    live = jnp.arange(resolution.pieces) < count
+
+    # Two charts give the place where they meet the same `s`, also where that place moves with the scene.
+    before = jnp.concatenate([owner_chart[:1], owner_chart[:-1]])
+    coordinate = jax.vmap(_coordinate, (None, 0, 0))
+    jump = jnp.where(live, coordinate(march, before, entry) - coordinate(march, owner_chart, entry), 0.0)
+    shift = jnp.cumsum(jump)
+    anchor_s = march.anchor_s[owner_chart] + shift
+    end_s = places.end_s + shift[-1]
+    kinks = jnp.where(inside, jnp.where(inside, places.s, 0.0) + shift[:-1], end_s)
+    breaks = jnp.concatenate([_coordinate(march, 0, start)[None], kinks, end_s[None]])
+
+    old = march.charts[before]
+    x_entry = jax.vmap(lambda z, u: tangent(system, z, u))(entry, old)
+    factor = jnp.where(live, (chart * x_entry).sum(1) / (old * x_entry).sum(1), 1.0)
 
     first, panels, owner = _panels(stop_gradient(breaks), count, resolution)
     local = (jnp.arange(resolution.panels) - first[owner])[:, None] + (chebyshev(resolution.nodes) + 1) / 2

@@ -1,0 +1,310 @@
+"""Optimisers side by side: the package's descent, direct collocation with IPOPT, and the paper's search by 10 %.
+
+    python benchmarks/optimisation.py [--quick] [--knots N] [--reference {solve,reuse,none}]
+
+The same plans for all: both bundled ones at 1.0, 0.3 and 0.15 s a phase, and a dozen on random polygons
+(`random_plans`) at 1.0 and 0.3 s; the search chooses its own durations. Every margin is that of the package's own
+simulation of the torques found, and a plan fails unless that simulation's status is `ok`. Times are warm: `optimise`
+and `search` run twice and the second run counts, tracing included. Of the collocation only IPOPT's own time counts:
+for all solves from the guess that led to the result, and for the best of these solves alone; what building its
+programmes took stands beside it. The reference is the largest margin that
+collocation finds at any cost (`collocation.best_known`), with finer intervals and from several starts; `--reference
+reuse` takes it from the last results.
+"""
+
+import argparse
+import inspect
+import json
+import statistics
+import time
+from dataclasses import asdict, dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import measure
+import numpy as np
+from collocation import CONVERGED, Collocated, best_known, collocate
+from matplotlib import pyplot as plt
+from random_plans import random_plans
+
+import wholearm_jax as wa
+
+jax.config.update("jax_enable_x64", True)
+
+BUNDLED, RANDOM = (1.0, 0.3, 0.15), (1.0, 0.3)  # durations of a phase [s]
+PLANS, SEED = 12, 0
+USUAL = inspect.signature(wa.optimise).parameters["knots"].default
+NEAR = 0.99  # share of the reference that counts as equal
+
+
+@dataclass(frozen=True)
+class PhaseRow:
+    """One phase: margins [N] and statuses of every contender.
+
+    `claimed` is the least force at the collocation points, `nearly` says whether the collocation's motion fails only
+    because it arrives inexactly.
+    """
+
+    phase: str
+    bound: float
+    optimise: float
+    optimise_status: str
+    collocation: float
+    collocation_status: str
+    claimed: float
+    nearly: bool
+    missed: float
+    ipopt: str
+    iterations: int
+    guesses: int
+    search: float
+    search_status: str
+    reference: float | None = None
+
+    @property
+    def best(self) -> float:
+        """The largest margin that a simulation confirms [N]."""
+        held = self.collocation if self.collocation_status == "ok" else -np.inf
+        return max(held, self.reference or -np.inf)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One plan at one duration [s] of each phase: seconds by contender, simulations of the search, phases."""
+
+    plan: str
+    duration: float
+    optimise_seconds: float
+    ipopt_seconds: float
+    best_solve_seconds: float
+    build_seconds: float
+    search_seconds: float
+    simulations: int
+    phases: tuple[PhaseRow, ...]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="bundled plans and four random ones, 1.0 s, no reference")
+    parser.add_argument("--knots", type=int, default=USUAL, help="torques a joint and phase, for both optimisers")
+    parser.add_argument("--reference", choices=("solve", "reuse", "none"), default="solve")
+    chosen = parser.parse_args()
+    name = "optimisation" if chosen.knots == USUAL else f"optimisation_{chosen.knots}_knots"
+    references = _stored(name) if chosen.reference == "reuse" else {}
+    cases = []
+    for plan, scene, durations in _plans(chosen.quick):
+        wa.search(scene)
+        searched = wa.search(scene)
+        for duration in durations:
+            case, found = _case(plan, _lasting(scene, duration), chosen.knots, searched)
+            if chosen.reference == "solve" and not chosen.quick:
+                case = _with_reference(case, found)
+            elif references:
+                case = _recalled(case, references)
+            cases.append(case)
+            _print(case)
+    summary = _summary(cases)
+    print(json.dumps(summary, indent=1))
+    if not chosen.quick:
+        rows = [asdict(case) for case in cases]
+        measure.save(name, {"knots": chosen.knots, "summary": summary, "cases": rows})
+        draw(cases, measure.RESULTS / f"{name}.svg")
+
+
+def _plans(quick: bool):
+    """Name, scene and durations of every plan."""
+    for name in ("heptagon", "hexagon"):
+        yield name, wa.load(name), BUNDLED[:1] if quick else BUNDLED
+    for number, scene in enumerate(random_plans(4 if quick else PLANS, SEED)):
+        yield f"random {number}", scene, RANDOM[:1] if quick else RANDOM
+
+
+# --- the contenders ---------------------------------------------------------------------------------------------------
+
+
+def _lasting(scene: wa.Scene, duration: float) -> wa.Scene:
+    """The plan with one duration [s] for every phase."""
+    lengths = [jnp.asarray(duration)] * len(scene.phases)
+    return eqx.tree_at(lambda s: [phase.duration for phase in s.phases], scene, lengths)
+
+
+def _optimised(scene: wa.Scene, knots: int):
+    """`optimise`, warm: what it found and its seconds."""
+    wa.optimise(scene, knots=knots)
+    begun = time.perf_counter()
+    found = wa.optimise(scene, knots=knots)
+    jax.block_until_ready(found.torque)
+    return found, time.perf_counter() - begun
+
+
+def _case(plan: str, scene: wa.Scene, knots: int, searched):
+    """Run both optimisers on one plan; also the tables and solutions from which `_with_reference` goes on."""
+    descended, taken = _optimised(scene, knots)
+    duration = float(scene.phases[0].duration)
+    tables = [at.table for at in wa.trace(scene)]
+    collocated = [collocate(table, duration, knots=knots) for table in tables]
+    contenders = (descended.result.phases, descended.bounds, collocated, searched.result.phases)
+    case = Case(
+        plan=plan,
+        duration=duration,
+        optimise_seconds=taken,
+        ipopt_seconds=sum(one.solve for one in collocated),
+        best_solve_seconds=sum(one.best_solve for one in collocated),
+        build_seconds=sum(one.build for one in collocated),
+        search_seconds=searched.seconds,
+        simulations=searched.simulations,
+        phases=tuple(_row(*each) for each in zip(*contenders, strict=True)),
+    )
+    return case, list(zip(tables, collocated, strict=True))
+
+
+def _row(descended, bound, collocated: Collocated, searched) -> PhaseRow:
+    return PhaseRow(
+        phase=descended.name,
+        bound=float(bound.value),
+        optimise=descended.margin,
+        optimise_status=descended.status.label,
+        collocation=collocated.margin,
+        collocation_status=collocated.verdict if collocated.ipopt in CONVERGED else collocated.ipopt,
+        claimed=collocated.course.least,
+        nearly=collocated.nearly,
+        missed=collocated.missed,
+        ipopt=collocated.ipopt,
+        iterations=collocated.iterations,
+        guesses=collocated.guesses,
+        search=searched.margin,
+        search_status=searched.status.label,
+    )
+
+
+def _with_reference(case: Case, found: list) -> Case:
+    rows = []
+    for row, (table, collocated) in zip(case.phases, found, strict=True):
+        best = best_known(table, case.duration, collocated)
+        rows.append(replace(row, reference=best.margin if best.succeeded else None))
+    return replace(case, phases=tuple(rows))
+
+
+def _stored(name: str) -> dict[tuple[str, float, str], float | None]:
+    """The references of the last results."""
+    cases = json.loads((measure.RESULTS / f"{name}.json").read_text())["cases"]
+    return {
+        (case["plan"], case["duration"], row["phase"]): row["reference"] for case in cases for row in case["phases"]
+    }
+
+
+def _recalled(case: Case, references) -> Case:
+    rows = [replace(row, reference=references.get((case.plan, case.duration, row.phase))) for row in case.phases]
+    return replace(case, phases=tuple(rows))
+
+
+# --- what is reported -------------------------------------------------------------------------------------------------
+
+
+def _print(case: Case) -> None:
+    times = f"{case.optimise_seconds:.2f} s against {case.ipopt_seconds:.2f} s (+ {case.build_seconds:.1f} s building)"
+    print(f"{case.plan}, {case.duration} s a phase: {times}; search {case.search_seconds:.2f} s")
+    for row in case.phases:
+        reference = "" if row.reference is None else f", best known {row.reference:.4f}"
+        print(
+            f"    {row.phase:12s} bound {row.bound:.4f}{reference}: optimise {row.optimise:.4f} {row.optimise_status}, "
+            f"collocation {row.collocation:.4f} {row.collocation_status} (claims {row.claimed:.4f}), "
+            f"search {row.search:.4f} {row.search_status}",
+            flush=True,
+        )
+
+
+def _summary(cases: list[Case]) -> dict:
+    """Counts of failures, shares of the bound and of the reference, and ratios of times."""
+    rows = [row for case in cases for row in case.phases]
+    held = [row for row in rows if row.optimise_status == "ok"]
+    against = [row.optimise / row.best for row in held if row.best > 0]
+    at_one = [row for case in cases if case.duration == 1.0 for row in case.phases if row.optimise_status == "ok"]
+    return {
+        "phases": len(rows),
+        "failed": {
+            "optimise": len(rows) - len(held),
+            "collocation": sum(row.collocation_status != "ok" for row in rows),
+            "collocation, arrival within 1e-3 allowed": sum(not row.nearly for row in rows),
+            "IPOPT itself": sum(row.ipopt not in CONVERGED for row in rows),
+            "search": sum(row.search_status != "ok" for row in rows),
+        },
+        "optimise / best known": _spread(against),
+        f"phases below {NEAR} of the best known": sum(share < NEAR for share in against),
+        "optimise / bound": _spread([row.optimise / row.bound for row in held]),
+        "optimise / bound at 1.0 s": _spread([row.optimise / row.bound for row in at_one]),
+        "collocation / bound": _spread([r.collocation / r.bound for r in rows if r.collocation_status == "ok"]),
+        "search / bound": _spread([r.search / r.bound for r in rows if r.search_status == "ok"]),
+        "seconds of optimise / IPOPT's best solves": _spread(
+            [case.optimise_seconds / case.best_solve_seconds for case in cases]
+        ),
+        "seconds of optimise / IPOPT": _spread([case.optimise_seconds / case.ipopt_seconds for case in cases]),
+        "seconds of optimise / IPOPT and building": _spread(
+            [case.optimise_seconds / (case.ipopt_seconds + case.build_seconds) for case in cases]
+        ),
+        "seconds of search / optimise": _spread([case.search_seconds / case.optimise_seconds for case in cases]),
+    }
+
+
+def _spread(values: list[float]) -> dict[str, float] | None:
+    if not values:
+        return None
+    return {"least": min(values), "median": statistics.median(values), "largest": max(values)}
+
+
+COLOURS = {"optimise": "#0072B2", "collocation": "#D55E00", "best known": "#222222", "search": "#009E73"}
+STYLES = {"optimise": "-", "collocation": "--", "best known": ":", "search": "-."}
+
+
+def draw(cases: list[Case], path) -> None:
+    """Left: phases that hold with at most a given loss against the bound; right: plans done within a given time."""
+    rows = [row for case in cases for row in case.phases]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.6), sharey=True, layout="constrained")
+    losses = {
+        "optimise": [1 - r.optimise / r.bound if r.optimise_status == "ok" else np.inf for r in rows],
+        "collocation": [1 - r.collocation / r.bound if r.collocation_status == "ok" else np.inf for r in rows],
+        "search": [1 - r.search / r.bound if r.search_status == "ok" else np.inf for r in rows],
+    }
+    if any(row.reference for row in rows):
+        losses["best known"] = [1 - r.best / r.bound if r.best > 0 else np.inf for r in rows]
+    for name, values in losses.items():
+        _steps(left, np.maximum(values, LEAST_LOSS), (LEAST_LOSS, 1.0), COLOURS[name], STYLES[name], name)
+    left.set_xlabel("margin lost against the bound, 1 - margin / bound")
+    left.set_ylabel("share of phases or plans [%]")
+    times = {
+        "optimise": ("optimise", [case.optimise_seconds for case in cases]),
+        "collocation, solving": ("collocation", [case.ipopt_seconds for case in cases]),
+        "collocation, with building": ("best known", [case.ipopt_seconds + case.build_seconds for case in cases]),
+        "search": ("search", [case.search_seconds for case in cases]),
+    }
+    every = np.concatenate([values for _, values in times.values()])
+    for label, (name, values) in times.items():
+        colour = COLOURS["collocation"] if label.startswith("coll") else COLOURS[name]
+        _steps(right, values, (every.min() / 1.5, every.max() * 1.5), colour, STYLES[name], label)
+    right.set_xlabel("wall time of a plan, warm [s]")
+    figure.savefig(path)
+    plt.close(figure)
+
+
+LEAST_LOSS = 1e-4  # losses below this are drawn there
+
+
+def _steps(ax, values, limits: tuple[float, float], colour: str, style, label: str) -> None:
+    """The share of values up to each value, as a staircase over a logarithmic axis."""
+    values = np.sort(values)
+    shown = values[np.isfinite(values)]
+    share = 100 * np.arange(1, len(shown) + 1) / len(values)
+    x = np.concatenate([[limits[0]], shown, [limits[1]]])
+    y = np.concatenate([[0.0], share, share[-1:] if len(share) else [0.0]])
+    ax.step(x, y, where="post", color=colour, linestyle=style, lw=1.8, label=label)
+    ax.set_xscale("log")
+    ax.set_xlim(*limits)
+    ax.set_ylim(0, 103)
+    ax.grid(True, which="major", color="#DDDDDD", lw=0.6)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.legend(frameon=False, fontsize=8, loc="best")
+
+
+if __name__ == "__main__":
+    main()

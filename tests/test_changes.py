@@ -1,0 +1,101 @@
+"""Changes of formation at speed: momentum, energy, what is refused, and derivatives through the change."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax import plan
+from wholearm_jax.contacts import normal_rows, slip_rows
+from wholearm_jax.formations import start_configuration
+from wholearm_jax.motion import Integration
+from wholearm_jax.reduction import change, horner, powers
+from wholearm_jax.scene import body
+from wholearm_jax.system import system
+
+FLIGHTS = ("flight", "passage")
+
+
+@pytest.fixture(scope="module", params=FLIGHTS)
+def flown(request):
+    return wa.optimise(wa.load(request.param), knots=31)
+
+
+def test_three_formations_without_a_stop(flown):
+    result = flown.result
+    assert result.status is wa.Status.OK
+    assert float(jnp.abs(flown.torque.values).max()) <= 1.0
+    for before, after in zip(result.phases[:-1], result.phases[1:], strict=True):
+        assert after.start == pytest.approx(before.time, abs=1e-12), "the change is when the formation ends"
+        assert float(jnp.abs(before.outcome.leaving).max()) > 1e-4, "moving"
+        assert min(after.impulses) > 0
+    assert float(jnp.abs(result.phases[0].outcome.leaving).max()) > 1.0, "the first change at speed"
+    for phase, top in zip(result.phases, flown.bounds, strict=True):
+        assert 0 < phase.margin <= float(top.value) + 1e-9
+
+
+def test_momentum_balances_and_energy_falls_across_every_change(flown):
+    scene = flown.scene
+    for before, after in zip(flown.result.phases[:-1], flown.result.phases[1:], strict=True):
+        formation = scene.phases[flown.result.phases.index(after)].formation
+        mechanics = system(body(scene.object), scene.hand, scene.gravity, formation)
+        z_dot, table = before.outcome.leaving, after.traced.table
+        entered = change(table, z_dot)
+        unit = mechanics.configuration_unit
+        z = start_configuration(table) / unit
+        panel, xi = powers(table, jnp.asarray(0), table.breaks[0])
+        moving = horner(table.velocity[panel], xi) * entered.speed / unit
+        sliding = jnp.sign(slip_rows(mechanics.contacts, z) @ moving)
+        wrench = normal_rows(mechanics.contacts, z)
+        wrench = wrench - (mechanics.contacts.friction * sliding)[:, None] * slip_rows(mechanics.contacts, z)
+        gained = mechanics.inertia * (moving - z_dot / unit)
+        given = wrench.T @ (entered.impulse / mechanics.force_unit)
+        scale = float(jnp.abs(mechanics.inertia * z_dot / unit).max())
+        np.testing.assert_allclose(gained, given, atol=1e-12 * scale)
+        energy = [float((mechanics.inertia * v**2).sum()) for v in (z_dot / unit, moving)]
+        assert energy[1] <= energy[0] * (1 + 1e-12)
+        assert float(jnp.abs(normal_rows(mechanics.contacts, z) @ moving).max()) < 1e-12 * float(jnp.abs(moving).max())
+
+
+def test_derivatives_pass_through_the_changes(flown):
+    """The last phase's motion depends on torques before two changes, whose moments move with them."""
+    scene, torque = flown.scene, flown.torque
+    traced = wa.trace(scene)
+    rng = np.random.default_rng(5)
+    # More push at the beginning than planned, so that every formation ends at its own moment, before its time.
+    ramp = jnp.asarray(np.linspace(1.0, 0.9, torque.values.shape[0]))[:, None]
+    base = torque.values * ramp
+    way = jnp.asarray(rng.normal(size=base.shape)) * 0.05
+
+    def end(amount, adjoint="none"):
+        schedule = wa.Torque(torque.times, base + amount * way)
+        found = plan.outcomes(scene, schedule, traced, Integration(tolerance=1e-13, max_steps=512, adjoint=adjoint))
+        second = found[1]
+        return jnp.stack([second.start, second.entered.speed, second.score.margin, *second.entered.impulse])
+
+    exact = jax.jvp(lambda a: end(a, "forward"), (0.0,), (1.0,))[1]
+    reverse = jax.jacrev(lambda a: end(a, "both"))(0.0)
+
+    def slope(h):
+        return (end(h) - end(-h)) / (2 * h)
+
+    richardson = (4 * slope(5e-4) - slope(1e-3)) / 3
+    np.testing.assert_allclose(exact, richardson, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(exact, reverse, rtol=1e-9, atol=1e-12)
+
+
+def test_a_change_that_would_throw_the_object_back_is_refused_by_name():
+    scene = wa.load("heptagon")  # the slide goes left, the flip right: no impact turns one into the other
+    flying = eqx.tree_at(lambda s: s.phases[0], scene, _flying(scene.phases[0]))
+    found = wa.optimise(scene, knots=31)
+    hasty = eqx.tree_at(lambda t: t.values, found.torque, found.torque.values.at[:31, 0].multiply(1.02))
+    result = wa.simulate(flying, hasty)
+    assert result.phases[0].status is wa.Status.OK
+    assert result.phases[1].status in (wa.Status.REVERSED, wa.Status.CONTACT_LOST)
+    assert result.phases[1].time == pytest.approx(result.phases[0].time)
+
+
+def _flying(phase):
+    return type(phase)(phase.name, phase.formation, phase.heading, phase.duration, arrive="moving")

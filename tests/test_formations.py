@@ -1,0 +1,43 @@
+"""Which formation next: what the bundled plans do is among the ways found, and no way is made up."""
+
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.formations import leaving, start_configuration, touching, ways
+from wholearm_jax.plan import end_configuration
+
+
+@pytest.mark.parametrize("name", ["heptagon", "hexagon"])
+def test_the_planned_phases_are_among_the_ways(name):
+    scene = wa.load(name)
+    traced = wa.trace(scene)
+    places = [start_configuration(traced[0].table), end_configuration(traced[0])]
+    tops = wa.bounds(scene, traced=traced)
+    for phase, at, z, top in zip(scene.phases, traced, places, tops, strict=True):
+        assert set(phase.formation.names) <= set(touching(scene, z))
+        same = [way for way in ways(scene, z) if set(way.contacts) == set(phase.formation.names)]
+        length = float(at.table.length)
+        way = min(same, key=lambda way: abs(way.length - length))
+        assert way.length == pytest.approx(length, rel=1e-3), "charts begin with the same tangent"
+        np.testing.assert_allclose(way.end, end_configuration(at), atol=1e-9)
+        assert way.bound == pytest.approx(float(top.value), rel=1e-6)
+
+
+def test_a_fifth_contact_stops_the_ways_that_would_push_into_it():
+    scene = wa.load("heptagon")
+    z = end_configuration(wa.trace(scene)[0])
+    assert "finger2:v4" in touching(scene, z)
+    old = [way for way in ways(scene, z) if set(way.contacts) == set(scene.phases[0].formation.names)]
+    assert [way.toward for way in old] == ["x+"], "the slide cannot go on, only back"
+
+
+def test_impacts_are_told():
+    scene = wa.load("heptagon")
+    end = wa.trace(scene)[0]
+    found = ways(scene, end_configuration(end), leaving(end.table))
+    flip = next(way for way in found if set(way.contacts) == set(scene.phases[1].formation.names))
+    assert flip.entering in ("turns back", "pulls")
+    onward = [way for way in found if way.entering.endswith("%")]
+    assert onward
+    assert all(way.speed > 0 and not way.pulls for way in onward)
