@@ -184,6 +184,12 @@ CONTACTS = {
     "three": (["palm:v5", "palm:v6", "finger1:v1"], "3 constraints", "exactly 4"),
     "five": (["palm:v5", "palm:v6", "finger1:v1", "finger2:v3", "finger2:v4"], "5 constraints", "exactly 4"),
     "none": ([], "0 constraints", "exactly 4"),
+    "too much rolling": (
+        ["palm:v5 rolling", "finger1:v1", "finger2:v3", "finger2:v4"],
+        "5 constraints (1 rolling, two each; 3 sliding, one each)",
+        "exactly 4",
+    ),
+    "rolling twice": (["palm:v5 rolling", "palm:v5", "finger2:v3"], "same contact", "twice"),
     "not a contact": (["palm:v5", "thumb:v6", "finger1:v1", "finger2:v3"], "'thumb:v6' is not a contact", "LINK:vN"),
     "negative number": (["palm:v-1", "palm:v6", "finger1:v1", "finger2:v3"], "'palm:v-1' is not a contact", "LINK:vN"),
     "two lines": (["palm:v5", "palm\n:v6", "finger1:v1", "finger2:v3"], "is not a contact", "LINK:vN"),

@@ -6,6 +6,9 @@ integrated; at each time one 9x9 system gives accelerations and contact forces,
     [ M    -(G_n - Xi U G_t)^T ] [ z_ddot ]   [ E tau + g - B z_dot - D sgn(z_dot) ]
     [ G_n   0                  ] [ c_n    ] = [ -G_n_dot z_dot                     ]
 
+A rolling contact adds a row of its own, `G_t z_ddot = -G_t_dot z_dot`, and a free tangential force `c_t`; `G_t_dot` is
+taken by complex-step differentiation, so that no second derivative is written down.
+
 Signs of slips (Xi) and of joint speeds are constants of a segment; segments end on torque knots and on reversals.
 """
 
@@ -44,12 +47,14 @@ class Contact:
     link: int
     kind: str
     feature: int
+    rolls: bool = False
 
 
 def contact(text):
-    """`finger1:v2` as a `Contact`."""
-    link, feature = text.split(":")
-    return Contact(LINKS.index(link), feature[0], int(feature[1:]))
+    """`finger1:v2` or `palm:v6 rolling` as a `Contact`."""
+    name, *rolls = text.split()
+    link, feature = name.split(":")
+    return Contact(LINKS.index(link), feature[0], int(feature[1:]), rolls == ["rolling"])
 
 
 class Model:
@@ -75,6 +80,7 @@ class Model:
         friction = solid["friction"]
         each = friction if isinstance(friction, dict) else dict.fromkeys(LINKS, friction)
         self.friction = np.array([each[LINKS[c.link]] for c in self.contacts])
+        self.rolls = np.array([c.rolls for c in self.contacts])
 
     # --- gaps, their gradients, slips and what is left of the second derivative without acceleration -----------------
 
@@ -83,7 +89,7 @@ class Model:
         q, phi = z[:2], z[2]
         turn = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]])
         vertex = turn @ self.vertices[c.feature]
-        gap_row, slip_row = np.zeros(5), np.zeros(5)
+        gap_row, slip_row = np.zeros((2, 5), np.result_type(z, z_dot))
         rate = z_dot[2]
         if c.link == 0:
             gap_row[:3] = 0.0, 1.0, vertex[0]
@@ -105,7 +111,7 @@ class Model:
             left = -2 * side * spin * (along @ velocity) - spin**2 * (normal @ reach) - rate**2 * (normal @ vertex)
             return gap, gap_row, slip_row, left
         after = turn @ self.vertices[(c.feature + 1) % len(self.vertices)]
-        edge = (after - vertex) / np.linalg.norm(after - vertex)
+        edge = (after - vertex) / np.sqrt((after - vertex) @ (after - vertex))
         normal = quarter(edge)
         arm = self.length[finger] * along + self.offset[finger] * side * quarter(along)
         tip = self.joint[finger] + arm
@@ -126,14 +132,24 @@ class Model:
         """Gaps, `G_n`, `G_t` and `G_n_dot z_dot` of all contacts."""
         return [np.array(column) for column in zip(*(self._contact(c, z, z_dot) for c in self.contacts), strict=True)]
 
+    def rolling(self, z, z_dot):
+        """`G_t` and `G_t_dot z_dot` of the contacts that roll."""
+        step = 1e-30
+        beside = self.geometry(z + 1j * step * z_dot, z_dot)[2]
+        return self.geometry(z, z_dot)[2][self.rolls], (beside.imag / step @ z_dot)[self.rolls]
+
     def reversing(self, z, z_dot):
-        """Slip velocities and joint speeds: what must not change sign within a segment."""
-        return np.concatenate([self.geometry(z, z_dot)[2] @ z_dot, z_dot[3:]])
+        """Slip velocities (0 for contacts that roll) and joint speeds: what must not change sign within a segment."""
+        return np.concatenate([np.where(self.rolls, 0.0, self.geometry(z, z_dot)[2] @ z_dot), z_dot[3:]])
 
     def solve(self, z, z_dot, torque, signs):
-        """Accelerations (5) and contact forces for given signs of slips (4) and joint speeds (2)."""
+        """Accelerations (5) and constraint forces (every `c_n`, then `c_t` of those that roll) for given signs of slips
+        and joint speeds (2)."""
         _, gap_rows, slip_rows, left = self.geometry(z, z_dot)
-        wrench = (gap_rows - (self.friction * signs[:-2])[:, None] * slip_rows).T
+        wrench = gap_rows - (self.friction * np.where(self.rolls, 0.0, signs[:-2]))[:, None] * slip_rows
+        held_rows, held_left = self.rolling(z, z_dot)
+        wrench, gap_rows = np.concatenate([wrench, held_rows]).T, np.concatenate([gap_rows, held_rows])
+        left = np.concatenate([left, held_left])
         matrix = np.block([[self.mass_matrix, -wrench], [gap_rows, np.zeros((len(left), len(left)))]])
         force = np.concatenate([self.mass * self.gravity, [0.0], torque])
         force[3:] -= self.viscous * z_dot[3:] + self.dry * signs[-2:]
@@ -142,7 +158,8 @@ class Model:
 
     def direction(self, z, toward):
         """The unit tangent of the wire at `z`, oriented by a coordinate and a sign such as `x-`."""
-        null = np.linalg.svd(self.geometry(z, np.zeros(5))[1])[2][-1]
+        rows = np.concatenate([self.geometry(z, np.zeros(5))[1], self.rolling(z, np.zeros(5))[0]])
+        null = np.linalg.svd(rows)[2][-1]
         return null if null[COORDINATES.index(toward[:-1])] * (1 if toward[-1] == "+" else -1) > 0 else -null
 
     # --- time ---------------------------------------------------------------------------------------------------------

@@ -272,29 +272,34 @@ def _traced(name: str, scene):
     """Trace a plan; refuse it, naming the contact, where a formation's contacts cannot all touch where it begins."""
     import numpy as np
 
-    from wholearm_jax.contacts import frames
+    from wholearm_jax.contacts import constraints, frames, placed
     from wholearm_jax.plan import end_configuration, trace
     from wholearm_jax.scene import body
     from wholearm_jax.system import system
 
     @jax.jit
-    def apart(formation, z):
+    def apart(formation, z, rough):
         mechanics = system(body(scene.object), scene.hand, scene.gravity, formation)
-        at, held = frames(mechanics.contacts, z), mechanics.contacts
+        held = placed(mechanics.contacts, rough / mechanics.configuration_unit)
+        at, missed = frames(held, z), jax.numpy.abs(constraints(held, z))
         beyond = jax.numpy.maximum(0.0, jax.numpy.maximum(held.lower - at.along, at.along - held.upper))
-        return jax.numpy.hypot(at.gap, beyond), mechanics.length, mechanics.configuration_unit
+        gap = jax.numpy.where(held.tangential, missed, jax.numpy.hypot(at.gap, beyond))
+        return gap, mechanics.length, mechanics.configuration_unit
 
     traced = trace(scene)
     for k, (phase, at) in enumerate(zip(scene.phases, traced, strict=True)):
-        gap, length, unit = apart(phase.formation, at.wire.start)
+        rough = end_configuration(traced[k - 1]) if k > 0 else scene.start
+        gap, length, unit = apart(phase.formation, at.wire.start, rough)
         where = "with the others, from this start"
         if k > 0 and not np.any(gap > 1e-6):
-            gap, _, _ = apart(phase.formation, end_configuration(traced[k - 1]) / unit)
+            gap, _, _ = apart(phase.formation, rough / unit, rough)
             where = f"where phase '{scene.phases[k - 1].name}' ends"
         if not np.all(gap <= 1e-6):
             worst = int(np.argmax(gap))
-            which, size = phase.formation.names[worst], float(gap[worst] * length)
-            key = f"phase[{k}].contacts"
+            which = phase.formation.names[phase.formation.contact_of_slot[worst]]
+            key, size = f"phase[{k}].contacts", float(gap[worst] * length)
+            if phase.formation.tangential[worst]:
+                raise _BadInput(f"{name}: {key}: {which} cannot stay in its place {where}: it is off by {size:.3g} m")
             raise _BadInput(f"{name}: {key}: {which} cannot touch {where}: a gap of {size:.3g} m stays open")
         if at.table.status != 0:
             break  # what follows a wire that cannot be followed has no start

@@ -8,6 +8,11 @@ and a gap `C`. With the object's origin `q` and the link's joint `j` the rows of
     G_t = [ t, -n.(P - q),   n.(P - j) on the link's own joint ]      slip velocity of the object against the link
 
 because `n.S r = t.r` and `t.S r = -n.r` for the quarter turn `S`.
+
+A formation constrains the gap of every contact, and the slip of those that roll. On straight features the latter is
+holonomic: the place `along` its feature at which the contact touches stays `held`, and the constraint
+
+    C_t = along - held  (palm, finger 1),  held - along  (finger 2, fingertips),      dC_t/dz = G_t exactly.
 """
 
 import equinox as eqx
@@ -19,22 +24,26 @@ from wholearm_jax.scene import EDGE, VERTEX, Body, Formation, Hand, next_vertex
 
 
 class Contacts(eqx.Module):
-    """Contacts as arrays; the leading axis runs over contacts.
+    """Contacts as arrays; the leading axis runs over the constraints of a formation (`Formation`).
 
     `along` (see `Frame`) must stay within `[lower, upper]`: the link's extent for type A, the edge's for type B.
+    `tangential` marks rows that constrain the slip, at the place `held`, and `slides` those of contacts that may slip.
     """
 
-    on_link: Bool[Array, "contacts"]
-    finger: Float[Array, "contacts 2"]
-    side: Float[Array, "contacts"]
-    joint: Float[Array, "contacts 2"]
-    reach: Float[Array, "contacts"]
-    offset: Float[Array, "contacts"]
-    point: Float[Array, "contacts 2"]
-    edge: Float[Array, "contacts 2"]
-    lower: Float[Array, "contacts"]
-    upper: Float[Array, "contacts"]
-    friction: Float[Array, "contacts"]
+    on_link: Bool[Array, "slots"]
+    finger: Float[Array, "slots 2"]
+    side: Float[Array, "slots"]
+    joint: Float[Array, "slots 2"]
+    reach: Float[Array, "slots"]
+    offset: Float[Array, "slots"]
+    point: Float[Array, "slots 2"]
+    edge: Float[Array, "slots 2"]
+    lower: Float[Array, "slots"]
+    upper: Float[Array, "slots"]
+    friction: Float[Array, "slots"]
+    tangential: Bool[Array, "slots"]
+    slides: Bool[Array, "slots"]
+    held: Float[Array, "slots"]
 
 
 class Frame(eqx.Module):
@@ -71,7 +80,15 @@ def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
         lower=jnp.where(on_link & palm, palm_lower, 0.0),
         upper=jnp.where(on_link, jnp.where(palm, palm_upper, reach), length),
         friction=body.friction[formation.link],
+        tangential=formation.tangential,
+        slides=~formation.tangential & ~jnp.roll(formation.tangential, -1),
+        held=jnp.zeros_like(length),
     )
+
+
+def placed(several: Contacts, z: Float[Array, "5"]) -> Contacts:
+    """Contacts that roll stay from now on at the places `along` their features which they have at `z`."""
+    return eqx.tree_at(lambda c: c.held, several, frames(several, z).along)
 
 
 def every_contact(capacity: int) -> Formation:
@@ -118,23 +135,45 @@ def gaps(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "contacts"]:
 def normal_rows(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "contacts 5"]:
     """`G_n = dC_n/dz`, the paper's `[W_n^T, -J_n]`."""
     at = frames(several, z)
-    n, t = at.normal, _turned(at.normal)
-    arm = -(t * at.from_joint).sum(1)
-    return jnp.concatenate([n, (t * at.from_object).sum(1)[:, None], arm[:, None] * several.finger], axis=1)
+    return _velocity_rows(several, at, at.normal)
 
 
 def slip_rows(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "contacts 5"]:
     """`G_t`, the paper's `[W_t^T, -J_t]`: slip velocity is `G_t z_dot`, the object against the link."""
     at = frames(several, z)
-    n, t = at.normal, _turned(at.normal)
-    arm = (n * at.from_joint).sum(1)
-    return jnp.concatenate([t, -(n * at.from_object).sum(1)[:, None], arm[:, None] * several.finger], axis=1)
+    return _velocity_rows(several, at, _turned(at.normal))
 
 
-def normal_curvature(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "contacts"]:
-    """`x^T (d2C/dz2) x` for each contact: what `G_n x' = -x^T H x` needs."""
-    _, rate = jax.jvp(lambda at: normal_rows(several, at) @ x, (z,), (x,))
+def slips(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "slots"]:
+    """`G_t x` of the contacts that may slip; 0 for those that roll."""
+    return jnp.where(several.slides, slip_rows(several, z) @ x, 0.0)
+
+
+def constraints(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "slots"]:
+    """What a formation keeps at zero: gaps `C_n(z)`, and `C_t(z)` in the tangential rows of rolling contacts."""
+    at = frames(several, z)
+    sense = jnp.where(several.on_link, several.side, -1.0)
+    return jnp.where(several.tangential, sense * (at.along - several.held), at.gap)
+
+
+def constraint_rows(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "slots 5"]:
+    """The gradient `G` of `constraints`: `G_n`, and `G_t` in the tangential rows."""
+    at = frames(several, z)
+    return _velocity_rows(several, at, jnp.where(several.tangential[:, None], _turned(at.normal), at.normal))
+
+
+def constraint_curvature(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "slots"]:
+    """`x^T (d2C/dz2) x` for each constraint: what `G x' = -x^T H x` needs."""
+    _, rate = jax.jvp(lambda at: constraint_rows(several, at) @ x, (z,), (x,))
     return rate
+
+
+def _velocity_rows(several: Contacts, at: Frame, direction: Float[Array, "slots 2"]) -> Float[Array, "slots 5"]:
+    """Rows whose product with `z_dot` is the velocity along a direction at the contact, the object against the link."""
+    across = _turned(direction)
+    arm = -(across * at.from_joint).sum(1)
+    turn = (across * at.from_object).sum(1)
+    return jnp.concatenate([direction, turn[:, None], arm[:, None] * several.finger], axis=1)
 
 
 def _turned(normal: Float[Array, "contacts 2"]) -> Float[Array, "contacts 2"]:

@@ -25,10 +25,10 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.forces import smooth_margin
+from wholearm_jax.forces import smooth_margin, spare
 from wholearm_jax.motion import Integration
 from wholearm_jax.reduction import Table, change, horner, powers
-from wholearm_jax.shooting import PARTS, SAMPLES, STEPS, Variables, local, shoot
+from wholearm_jax.shooting import PARTS, ROWS, SAMPLES, STEPS, Variables, local, shoot
 from wholearm_jax.squeeze import coefficients
 
 HOTTEST, COLDEST = 0.1, 1e-4  # temperatures, as shares of the bound
@@ -85,7 +85,7 @@ def rooms(q: Float[Array, "7"], later, unit, table: Table, limits: Limits, how, 
     ends = jnp.stack([log - jnp.log(limits.shortest), jnp.log(limits.longest) - log]) / jnp.where(free, span, 1.0)
     room = [(shot.forces / unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, shot.pace, ends]
     one = jnp.full((), 1 / intervals)
-    sampled = jnp.repeat(shot.weight, shot.forces.shape[1])
+    sampled = (shot.weight[:, None] * ~spare(table)).ravel()
     climbs = jnp.tile(jnp.where(bounded, one / 4, 0.0), 2)
     paces = jnp.full(STEPS, one).at[0].multiply(later)
     weight = [sampled, jnp.full(8, one / 4), climbs, paces, jnp.full(2, jnp.where(free, one / 4, 0.0))]
@@ -117,7 +117,7 @@ def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> 
         return _seams(unravel(x), tables, limits)
 
     loose = jnp.concatenate([jnp.zeros(defect.size, bool), _loose_seams(phases, limits)])
-    bears = np.arange(at.room.shape[2]) < PARTS * STEPS * SAMPLES * tables.force.shape[-2]
+    bears = np.arange(at.room.shape[2]) < PARTS * STEPS * SAMPLES * ROWS
     return Linear(
         at,
         rates,
@@ -212,8 +212,8 @@ def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
     """The primal-dual direction as an optax transformation; wants `linear=`, and makes its own gradient from it."""
 
     def init(params):
-        knots, contacts = (params.shape[0] // phases - 1) // 4, 4
-        shape = (phases, knots - 1, PARTS * STEPS * SAMPLES * contacts + 8 + 4 + STEPS + 2)
+        knots = (params.shape[0] // phases - 1) // 4
+        shape = (phases, knots - 1, PARTS * STEPS * SAMPLES * ROWS + 8 + 4 + STEPS + 2)
         start = jnp.full((), HOTTEST)
         return Duals(jnp.ones(shape), jnp.zeros(shape), jnp.full((), jnp.nan), start, jnp.zeros(2))
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon as Patch
 
 from wholearm_jax.plan import Result, trajectory
-from wholearm_jax.scene import Scene, body
+from wholearm_jax.scene import Scene, body, parse_contact
 
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
     from wholearm_jax.execution import Execution
@@ -118,7 +118,8 @@ def draw_torques(result: Result, ax: Axes | None = None) -> Axes:
 
 
 def draw_forces(result: Result, ax: Axes | None = None) -> Axes:
-    """Normal contact forces over time, with the margin and its moment marked."""
+    """Normal contact forces over time, with the margin and its moment marked; for contacts that roll also how far
+    inside its friction cone the force is, dotted."""
     ax = ax or plt.gca()
     named = set()
     for phase, course in zip(result.phases, trajectory(result, 801), strict=False):
@@ -127,6 +128,11 @@ def draw_forces(result: Result, ax: Axes | None = None) -> Axes:
             named.add(name)
             colour = _colour(result, name)
             ax.plot(course.time, course.cn[:, k], color=colour[0], ls=colour[1], lw=1.2, label=label)
+            if name.endswith(" rolling"):
+                grip = float(result.scene.object.friction[parse_contact(name)[0]])
+                slack = grip * course.cn[:, k] - np.abs(course.ct[:, k])
+                label = label and r"$\mu c_n - |c_t|$ of it"
+                ax.plot(course.time, slack, color=colour[0], ls=":", lw=1.6, label=label)
     worst = min(result.phases, key=lambda p: p.margin)
     if np.isfinite(worst.margin):
         ax.plot(worst.margin_time, worst.margin, "o", color=_INK, ms=4, zorder=5)

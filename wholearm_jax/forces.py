@@ -1,12 +1,16 @@
 r"""Score: the compressive margin of a motion, exact in time, and the smooth minimum that is optimised.
 
+What counts toward the margin [N] is the slack of each constraint's force: `c_n` itself, and `mu c_n - |c_t|`, how far
+inside its friction cone the force is, in the tangential row of a contact that rolls.
+
 Between accepted steps `s(u)` is the quintic with the right `s`, `ds/du` and `d2s/du2` at both ends, so that forces are
-known at every time, not only at steps. The margin is the least `c_n` over continuous time and all contacts: samples
+known at every time, not only at steps. The margin is the least slack over continuous time and all contacts: samples
 find its neighbourhood, golden section its place. Its derivative is that of the force at the place found (the envelope
 theorem), landings and knots included.
 """
 
 import math
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -19,13 +23,15 @@ from wholearm_jax.reduction import Table, horner, powers
 from wholearm_jax.schedule import Window, torque_in
 
 SAMPLES = 7  # places in a step at which forces are sampled before the minimum is refined
+MOST_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
 REFINED = 4  # lowest samples refined; a minimum is missed only if four others sample lower
 
 
 class Score(eqx.Module):
-    """The least contact force of a phase: `margin` [N], its time as a share of the phase, its `s` and contact number.
+    """The least slack of a phase: `margin` [N], its time as a share of the phase, its `s` and the number of its row in
+    the formation, `contact`.
 
-    `lost` is the share at which a force first turns tensile (infinite if none does), `lost_contact` whose.
+    `lost` is the share at which a contact first pulls or slips (infinite if none does), `lost_contact` its row.
     """
 
     margin: Float[Array, ""]
@@ -89,8 +95,8 @@ def on_arc(one: Arcs, xi: Float[Array, ""]):
     return one.share[0] + xi * width, s, jnp.where(moving, slope / jnp.where(moving, width, 1.0), 0.0)
 
 
-def force(table: Table, seen: Window, duration, piece, row, share, s, w) -> Float[Array, "contacts"]:
-    """Contact forces `c_n` [N] for forward travel."""
+def force(table: Table, seen: Window, duration, piece, row, share, s, w) -> Float[Array, "slots"]:
+    """Constraint forces [N] for forward travel: `c_n`, and `c_t` in tangential rows."""
     panel, xi = powers(table, piece, s)
     terms = horner(table.force[panel], xi)
     v = w / duration
@@ -98,18 +104,45 @@ def force(table: Table, seen: Window, duration, piece, row, share, s, w) -> Floa
     return terms @ jnp.concatenate([jnp.stack([one, v**2, v]), torque_in(seen, row, share)])
 
 
-def forces_on(table: Table, seen: Window, duration, arc: Arcs, xi) -> Float[Array, "contacts"]:
-    """Contact forces at `xi` of one arc."""
+def slack(table: Table, forces: Float[Array, "slots"]) -> Float[Array, "slots"]:
+    """What of constraint forces counts toward the margin [N]: `c_n`, and `mu c_n - |c_t|` in tangential rows."""
+    cone = table.grip * jnp.roll(forces, 1) - jnp.abs(forces)  # a contact's normal row stands before its tangential one
+    return jnp.where(table.tangential, cone, forces)
+
+
+def linear_slacks(table: Table, forces: Float[Array, "slots *terms"]) -> Float[Array, "rows *terms"]:
+    """Linear functions of the forces whose least is the least `slack`: both sides of each friction cone.
+
+    `forces` may be coefficients, by any linear terms. Four constraints have at most two tangential rows, and so there
+    are six of these; those not needed (`spare`) repeat the first.
+    """
+    column = (slice(None), *(None,) * (forces.ndim - 1))
+    normal = table.grip[column] * jnp.roll(forces, 1, axis=0)
+    one_side = jnp.where(table.tangential[column], normal - forces, forces)
+    (rolling,) = jnp.nonzero(table.tangential, size=MOST_ROLLING, fill_value=-1)
+    other = jnp.where((rolling >= 0)[column], (normal + forces)[rolling], forces[0])
+    return jnp.concatenate([one_side, other])
+
+
+def spare(table: Table) -> Bool[Array, "rows"]:
+    """Which of `linear_slacks` repeat another."""
+    slots = table.tangential.shape[0]
+    return jnp.arange(slots + MOST_ROLLING) >= slots + table.tangential.sum()
+
+
+def slacks_on(table: Table, seen: Window, duration, arc: Arcs, xi, kind=slack) -> Float[Array, "rows"]:
+    """`slack` (or `linear_slacks`) at `xi` of one arc."""
     share, s, w = on_arc(arc, xi)
-    return force(table, seen, duration, arc.piece, arc.row, share, s, w)
+    return kind(table, force(table, seen, duration, arc.piece, arc.row, share, s, w))
 
 
-def sampled_forces(
-    table: Table, seen: Window, duration, steps: Arcs, samples: int = SAMPLES
-) -> Float[Array, "steps samples contacts"]:
-    """Forces at evenly spaced places of every step, its two ends included; infinite where nothing moves."""
+def sampled_slacks(
+    table: Table, seen: Window, duration, steps: Arcs, samples: int = SAMPLES, kind=slack
+) -> Float[Array, "steps samples rows"]:
+    """`slack` (or `linear_slacks`) at evenly spaced places of every step, ends included; infinite where all rests."""
     xi = jnp.linspace(0.0, 1.0, samples, dtype=steps.quintic.dtype)
-    at = jax.vmap(jax.vmap(forces_on, (None, None, None, None, 0)), (None, None, None, 0, None))
+    on = partial(slacks_on, kind=kind)
+    at = jax.vmap(jax.vmap(on, (None, None, None, None, 0)), (None, None, None, 0, None))
     values = at(table, seen, duration, steps, xi)
     return jnp.where((steps.live & ~steps.held)[:, None, None], values, jnp.inf)
 
@@ -121,7 +154,7 @@ def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion
     is as accurate as the integration.
     """
     steps = arcs(table, seen, duration, motion)
-    values = stop_gradient(sampled_forces(table, seen, duration, steps))
+    values = stop_gradient(sampled_slacks(table, seen, duration, steps))
     per_step = values.min(1)
     _, lowest = jax.lax.top_k(-per_step.ravel(), REFINED)
 
@@ -132,21 +165,21 @@ def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion
         fixed = stop_gradient((table, seen, duration, arc))
 
         def one(xi):
-            return forces_on(*fixed, xi)[contact]
+            return slacks_on(*fixed, xi)[contact]
 
         xi = _minimise(one, seat, 1.0 / (SAMPLES - 1))
         length = xi * (arc.share[1] - arc.share[0])
         begin = jnp.stack([arc.quintic[0], motion.entry_w[step]])
         s, w = single_step(table, seen, duration, how, arc.piece, arc.row, arc.share[0], begin, length)
         share = arc.share[0] + length
-        here, slope = _force_and_slope(table, seen, duration, arc, contact, share, s, w)
+        here, slope = _slack_and_slope(table, seen, duration, arc, contact, share, s, w)
         inner = (xi > 0) & (xi < 1)
         here = here + slope * stop_gradient(jnp.where(inner, _to_minimum(fixed, contact, xi, slope), 0.0))
         return jnp.where(arc.live & ~arc.held, here, jnp.inf), share, s, contact
 
     margin, share, s, contact = jax.vmap(refine)(lowest)
     best = jnp.argmin(stop_gradient(margin))
-    lost, lost_contact = _first_tension(*stop_gradient((table, seen, duration, steps)), values)
+    lost, lost_contact = _first_loss(*stop_gradient((table, seen, duration, steps)), values)
     return Score(margin[best], share[best], s[best], contact[best], lost, lost_contact)
 
 
@@ -173,11 +206,11 @@ def smooth_margin(values, weights, temperature: Float[Array, ""]) -> tuple[Float
     return m + temperature * (weights * jnp.log(jnp.where(live, values - m, 1.0) / temperature)).sum(), m
 
 
-def _force_and_slope(table, seen, duration, arc, contact, share, s, w):
-    """A contact force at a state, and its rate per share of the phase along the motion."""
+def _slack_and_slope(table, seen, duration, arc, contact, share, s, w):
+    """A constraint's slack at a state, and its rate per share of the phase along the motion."""
 
     def at(share, s, w):
-        return force(table, seen, duration, arc.piece, arc.row, share, s, w)[contact]
+        return slack(table, force(table, seen, duration, arc.piece, arc.row, share, s, w))[contact]
 
     bend = acceleration(table, seen, duration, arc.piece, arc.row, share, s, w)
     return jax.jvp(at, (share, s, w), (jnp.ones_like(share), w, bend))
@@ -190,7 +223,7 @@ def _to_minimum(fixed, contact, xi, slope):
     """
     table, seen, duration, arc = fixed
     width = jnp.where(arc.share[1] > arc.share[0], arc.share[1] - arc.share[0], 1.0)
-    curve = jax.grad(jax.grad(lambda xi: forces_on(table, seen, duration, arc, xi)[contact]))(xi) / width**2
+    curve = jax.grad(jax.grad(lambda xi: slacks_on(table, seen, duration, arc, xi)[contact]))(xi) / width**2
     return -slope / jnp.where(curve > 0, curve, jnp.inf)
 
 
@@ -218,8 +251,8 @@ def _minimise(function, seat, reach):
     return stop_gradient(jax.lax.fori_loop(0, 40, narrow, start)[2])
 
 
-def _first_tension(table, seen, duration, steps, values):
-    """The share at which a contact force first turns negative, by bisection from the first sample that is."""
+def _first_loss(table, seen, duration, steps, values):
+    """The share at which a contact's slack first turns negative, by bisection from the first sample that is."""
     least = values.min(2)
     negative = least < 0
     first = jnp.argmax(negative.ravel())
@@ -231,10 +264,10 @@ def _first_tension(table, seen, duration, steps, values):
     def halve(_, bracket):
         low, high, contact = bracket
         middle = (low + high) / 2
-        forces = forces_on(table, seen, duration, arc, middle)
-        tensile = forces.min() < 0
-        contact = jnp.where(tensile, jnp.argmin(forces), contact)
-        return jnp.where(tensile, low, middle), jnp.where(tensile, middle, high), contact
+        slacks = slacks_on(table, seen, duration, arc, middle)
+        gone = slacks.min() < 0
+        contact = jnp.where(gone, jnp.argmin(slacks), contact)
+        return jnp.where(gone, low, middle), jnp.where(gone, middle, high), contact
 
     bracket = (jnp.maximum(high - width, 0.0), high, jnp.argmin(values[step, sample]))
     _, xi, contact = jax.lax.fori_loop(0, 50, halve, bracket)

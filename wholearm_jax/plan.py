@@ -25,6 +25,7 @@ from wholearm_jax.system import system
 from wholearm_jax.verdict import Verdict, judge
 from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
 
+SLIPPING = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
 CONTINUITY = 1e-6  # metres and radians by which a phase may begin beside the end of the one before it
 
 
@@ -54,6 +55,7 @@ class PhaseResult:
 
     `time` is when the phase ended or failed. A phase that is entered while moving begins at `start` with `impulses`
     [N s], one a contact.
+    `slips` says that the contact lost is one that should roll, and that it leaves its friction cone.
     """
 
     name: str
@@ -62,6 +64,7 @@ class PhaseResult:
     status: Status
     time: float
     contact: str | None
+    slips: bool
     start: float
     duration: float
     margin: float
@@ -78,7 +81,8 @@ class PhaseResult:
         if self.status is Status.OK:
             return f"{self.name}: ok, margin {self.margin:.4g} N at {self.margin_contact}, t = {self.margin_time:.4g} s"
         whose = f" at {self.contact}" if self.contact else ""
-        return f"{self.name}: {self.status.label}{whose}, t = {self.time:.6g} s: {self.status.advice}"
+        advice = SLIPPING if self.slips else self.status.advice
+        return f"{self.name}: {self.status.label}{whose}, t = {self.time:.6g} s: {advice}"
 
 
 @dataclass(frozen=True)
@@ -220,7 +224,8 @@ def margin(
     how: Integration = Integration(adjoint="both"),
     resolution: Resolution = Resolution(),
 ) -> Float[Array, ""]:
-    """The compressive margin [N] of a plan: the least `c_n` over time and contacts, formations assumed to hold.
+    """The compressive margin [N] of a plan: the least `c_n` over time and contacts (and, of those that roll, the least
+    `mu c_n - |c_t|`), formations assumed to hold.
 
     Differentiable, in forward and reverse mode, with respect to the torques and every float of the scene; negative
     where a contact would pull; `-inf` where a phase has no motion to score. Whether the plan succeeds is for
@@ -262,7 +267,7 @@ def describe(scene: Scene, torque: Torque, traced, found) -> Result:
     for phase, at, outcome in zip(scene.phases, traced, found, strict=True):
         names, start, length = phase.formation.names, float(outcome.start), float(outcome.duration)
         verdict, scored = outcome.verdict, outcome.score
-        contact = int(verdict.contact)
+        slot, of_slot = int(verdict.contact), phase.formation.contact_of_slot
         known = bool(np.isfinite(scored.margin)) and int(at.table.status) == Status.OK
         rows.append(
             PhaseResult(
@@ -271,14 +276,15 @@ def describe(scene: Scene, torque: Torque, traced, found) -> Result:
                 contacts=names,
                 status=Status(int(verdict.status)),
                 time=start + length * float(verdict.share),
-                contact=names[contact] if contact >= 0 else None,
+                contact=names[of_slot[slot]] if slot >= 0 else None,
+                slips=slot >= 0 and bool(phase.formation.tangential[slot]),
                 start=start,
                 duration=length,
                 margin=float(scored.margin) if known else float("-inf"),
                 margin_time=start + length * float(scored.share),
                 margin_s=float(scored.s),
-                margin_contact=names[int(scored.contact)],
-                impulses=tuple(float(p) for p in outcome.entered.impulse),
+                margin_contact=names[of_slot[int(scored.contact)]],
+                impulses=tuple(float(outcome.entered.impulse[k]) for k in phase.formation.normal_slots),
                 traced=at,
                 outcome=outcome,
             )
@@ -300,12 +306,15 @@ def ending(traced: Traced, phase: Phase, capacity: int) -> str:
         link, kind = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1))[group]
         return f"{contact_name(link, kind, feature)} is made"
     if why == LEFT:
-        return f"{phase.formation.names[index]} leaves its feature"
+        return f"{phase.formation.names[phase.formation.contact_of_slot[index]]} leaves its feature"
     return "the phase's own limit is reached" if why == UNTIL else "no end was found"
 
 
 class Trajectory(NamedTuple):
-    """A phase sampled in time, SI units; `cn` and `ct` are NaN while friction holds the object at rest."""
+    """A phase sampled in time, SI units; `cn` and `ct` are NaN while friction holds the object at rest.
+
+    Their columns are the formation's contacts in order; those it has fewer than four are NaN.
+    """
 
     time: Float[Array, "samples"]
     s: Float[Array, "samples"]
@@ -314,6 +323,14 @@ class Trajectory(NamedTuple):
     torque: Float[Array, "samples 2"]
     cn: Float[Array, "samples contacts"]
     ct: Float[Array, "samples contacts"]
+
+
+def by_contact(table: Table, piece, forces: Float[Array, "slots"]):
+    """`c_n` and `c_t` of every contact from the forces in the constraints; NaN beyond the last contact."""
+    rolls = jnp.roll(table.tangential, -1)
+    tangential = jnp.where(rolls, jnp.roll(forces, -1), forces * table.tension[piece])
+    (slot,) = jnp.nonzero(~table.tangential, size=forces.shape[0], fill_value=-1)
+    return tuple(jnp.where(slot >= 0, values[slot], jnp.nan) for values in (forces, tangential))
 
 
 @eqx.filter_jit
@@ -331,11 +348,11 @@ def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shar
         over = share > motion.share[motion.count] + 1e-12
         w = jnp.where(over, 0.0, w)
         panel, at = powers(table, arc.piece, s)
-        cn = force(table, seen, duration, arc.piece, arc.row, share, s, w)
-        cn = jnp.where(arc.held | over, jnp.nan, cn)
+        forces = force(table, seen, duration, arc.piece, arc.row, share, s, w)
+        cn, ct = by_contact(table, arc.piece, jnp.where(arc.held | over, jnp.nan, forces))
         tau = seen.values[arc.row] + seen.slope[arc.row] * (share - seen.share[arc.row])
         z_dot = horner(table.velocity[panel], at) * w / duration
-        return s, horner(table.configuration[panel], at), z_dot, tau, cn, cn * table.tension[arc.piece]
+        return s, horner(table.configuration[panel], at), z_dot, tau, cn, ct
 
     return Trajectory(start + duration * shares, *jax.vmap(one)(shares))
 

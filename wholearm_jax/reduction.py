@@ -5,7 +5,8 @@ at each `s` one 5x5 linear system gives everything (the paper's eqs. 1-4 and 12-
 
     [ M x , -(G_n - Xi U G_t)^T ] [a ; c_n] = E tau + g - M x' v^2 - B x v - D sgn(x v)
 
-Its answer is linear in `(1, v^2, v, tau1, tau2)`. For forward travel the coefficients are functions of `s` alone, here
+A contact that rolls has no friction law, `Xi = 0`, but a column `-G_t^T` with its tangential force `c_t` as unknown.
+The answer is linear in `(1, v^2, v, tau1, tau2)`. For forward travel the coefficients are functions of `s` alone, here
 tabulated as one polynomial a panel of the wire.
 """
 
@@ -14,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.contacts import normal_curvature, normal_rows, slip_rows
+from wholearm_jax.contacts import constraint_curvature, constraint_rows, slip_rows
 from wholearm_jax.status import Status
 from wholearm_jax.system import System, configuration_unit
 from wholearm_jax.wire import Resolution, Wire, chebyshev
@@ -28,10 +29,11 @@ class Table(eqx.Module):
     """A reduced wire: polynomials in the panel coordinate `xi` in [-1, 1], lowest power first, SI units.
 
     `acceleration[p, k]` are the coefficients of `a = ds^2/dt^2` in `(1, v^2, v, tau1, tau2)`, `force[p, k, i]` those of
-    contact `i`'s `c_n` [N], `configuration[p, k]` those of `z`, `velocity[p, k]` those of `dz/ds`. `backward[p, k]` are
-    those of `a` in `(1, tau1, tau2)` for travel the other way at rest, times the square of the 5x5 determinant (against
-    that without friction): the same sign, and smooth where friction would wedge the object on its way back.
-    `tension[piece, i]` is `c_t / c_n` (eq. 3).
+    the force in constraint `i` [N]: `c_n`, or `c_t` where `tangential` (a contact that rolls), with `grip` its friction
+    coefficient (0 elsewhere). `configuration[p, k]` are those of `z`, `velocity[p, k]` those of `dz/ds`.
+    `backward[p, k]` are those of `a` in `(1, tau1, tau2)` for travel the other way at rest, times the square of the 5x5
+    determinant (against that without friction): the same sign, and smooth where friction would wedge the object on its
+    way back. `tension[piece, i]` is `c_t / c_n` (eq. 3) where a contact slides.
     `entry` serves an object that arrives with `z_dot` from another formation: its rows times `z_dot` are `ds/dt` after
     the inelastic impact and the contacts' impulses [N s] (see `change`).
     `error` is the largest interpolation error, relative to each function's own size; `condition` the largest
@@ -45,10 +47,12 @@ class Table(eqx.Module):
     panels: Int[Array, "pieces"]
     acceleration: Float[Array, "panels powers 5"]
     backward: Float[Array, "panels powers 3"]
-    force: Float[Array, "panels powers contacts 5"]
+    force: Float[Array, "panels powers slots 5"]
     configuration: Float[Array, "panels powers 5"]
     velocity: Float[Array, "panels powers 5"]
-    tension: Float[Array, "pieces contacts"]
+    tension: Float[Array, "pieces slots"]
+    tangential: Bool[Array, "slots"]
+    grip: Float[Array, "slots"]
     entry: Float[Array, "5 5"]
     torque_limit: Float[Array, "2"]
     error: Float[Array, ""]
@@ -68,7 +72,7 @@ def balance(system: System, z, x, bend, slip_sign, joint_sign):
     `x = dz/ds`, `bend = x'`; `slip_sign` is Xi, `joint_sign` the signs of the joint speeds.
     """
     friction = (system.contacts.friction * slip_sign)[:, None] * slip_rows(system.contacts, z)
-    wrench = (normal_rows(system.contacts, z) - friction).T
+    wrench = (constraint_rows(system.contacts, z) - friction).T
     matrix = jnp.concatenate([(system.inertia * x)[:, None], -wrench], axis=1)
     none, weight = jnp.zeros(3, z.dtype), system.inertia[0] * system.gravity
     dry = jnp.concatenate([weight, jnp.zeros(1, z.dtype), -system.dry * joint_sign])
@@ -78,11 +82,12 @@ def balance(system: System, z, x, bend, slip_sign, joint_sign):
 
 
 def along_wire(system: System, z, u):
-    """`x = dz/ds` and `x' = d2z/ds2` in the chart with direction `u`: `G_n x = 0`, `u.x = 1`, `G_n x' = -x^T H x`."""
-    rows = jnp.concatenate([normal_rows(system.contacts, z), u[None]])
+    """`x = dz/ds` and `x' = d2z/ds2` in the chart with direction `u`: `G x = 0`, `u.x = 1`, `G x' = -x^T H x`."""
+    rows = jnp.concatenate([constraint_rows(system.contacts, z), u[None]])
     unit = jnp.zeros(5, z.dtype).at[4].set(1.0)
     x = jnp.linalg.solve(rows, unit)
-    bend = jnp.linalg.solve(rows, jnp.concatenate([-normal_curvature(system.contacts, z, x), jnp.zeros(1, z.dtype)]))
+    left = -constraint_curvature(system.contacts, z, x)
+    bend = jnp.linalg.solve(rows, jnp.concatenate([left, jnp.zeros(1, z.dtype)]))
     return x, bend
 
 
@@ -135,6 +140,8 @@ def reduce_wire(system: System, wire: Wire) -> Table:
         panels=wire.panels,
         **fitted,
         tension=-system.contacts.friction * wire.slip_sign,
+        tangential=system.contacts.tangential,
+        grip=jnp.where(system.contacts.tangential, system.contacts.friction, 0.0),
         entry=entry[-1] * jnp.append(1.0, jnp.full(4, newtons))[:, None] / unit,
         torque_limit=system.torque_limit,
         error=error,
@@ -152,6 +159,7 @@ def blank(resolution: Resolution, contacts: int = 4) -> Table:
     each |= {name: np.zeros((panels, nodes, 5)) for name in ("configuration", "velocity")}
     each |= {"force": np.zeros((panels, nodes, contacts, TERMS)), "tension": np.zeros((pieces, contacts))}
     each |= {"breaks": np.arange(pieces + 1.0), "factor": np.ones(pieces), "torque_limit": np.ones(2)}
+    each |= {"tangential": np.zeros(contacts, bool), "grip": np.zeros(contacts)}
     each |= {"entry": np.zeros((5, 5)), "first": np.zeros(pieces, int), "panels": np.ones(pieces, int)}
     filled = {name: jnp.asarray(value) for name, value in each.items()}
     return Table(count=whole + 1, error=zero, condition=zero, condition_s=zero, status=whole, **filled)
@@ -161,7 +169,7 @@ class Change(eqx.Module):
     """Entering a formation with speed: `ds/dt` [1/s] after the impact and the contacts' impulses [N s]."""
 
     speed: Float[Array, ""]
-    impulse: Float[Array, "contacts"]
+    impulse: Float[Array, "slots"]
 
 
 def change(table: Table, z_dot: Float[Array, "5"]) -> Change:

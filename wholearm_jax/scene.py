@@ -61,18 +61,37 @@ class Hand(eqx.Module):
 
 
 class Formation(eqx.Module):
-    """A contact formation as data: each contact's link (0 palm, 1, 2), type (`VERTEX`, `EDGE`) and feature number."""
+    """A contact formation as data: one row a constraint, with the contact's link (0 palm, 1, 2), type (`VERTEX`,
+    `EDGE`) and feature number.
 
-    link: Int[Array, "contacts"]
-    kind: Int[Array, "contacts"]
-    feature: Int[Array, "contacts"]
-    rolling: Bool[Array, "contacts"]
+    A sliding contact has one row, its gap. A rolling contact has two, one behind the other: its gap, then its slip,
+    marked `tangential`. Four rows make a wire: `2R + S = 4`.
+    """
+
+    link: Int[Array, "slots"]
+    kind: Int[Array, "slots"]
+    feature: Int[Array, "slots"]
+    tangential: Bool[Array, "slots"]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The contacts as files write them, e.g. `palm:v5`."""
-        rows = zip(*(np.asarray(a) for a in (self.link, self.kind, self.feature, self.rolling)), strict=True)
-        return tuple(contact_name(*(int(v) for v in row[:3]), rolling=bool(row[3])) for row in rows)
+        """The contacts as files write them, e.g. `palm:v5` or `palm:v6 rolling`: one a contact, not one a row."""
+        link, kind, feature, tangential = (
+            np.asarray(a).tolist() for a in (self.link, self.kind, self.feature, self.tangential)
+        )
+        rolling = [*tangential[1:], False]
+        rows = zip(link, kind, feature, rolling, tangential, strict=True)
+        return tuple(contact_name(*row[:3], rolling=row[3]) for row in rows if not row[4])
+
+    @property
+    def normal_slots(self) -> tuple[int, ...]:
+        """The row of each contact's gap."""
+        return tuple(np.flatnonzero(~np.asarray(self.tangential)).tolist())
+
+    @property
+    def contact_of_slot(self) -> tuple[int, ...]:
+        """Which of `names` each row belongs to."""
+        return tuple((np.cumsum(~np.asarray(self.tangential)) - 1).tolist())
 
 
 class Heading(eqx.Module):
@@ -138,10 +157,11 @@ def polygon(vertices, mass, friction, inertia=None, center_of_mass=None) -> Poly
 
 
 def formation(contacts) -> Formation:
-    """Build a `Formation` from contact names such as `"palm:v5"` or `"finger2:e3"`."""
-    rows = [parse_contact(text) for text in contacts]
-    link, kind, feature, rolling = (np.asarray(column) for column in zip(*rows, strict=True))
-    return Formation(jnp.asarray(link), jnp.asarray(kind), jnp.asarray(feature), jnp.asarray(rolling))
+    """Build a `Formation` from contact names such as `"palm:v5"`, `"finger2:e3"` or `"palm:v6 rolling"`."""
+    rows = []
+    for *feature, rolling in map(parse_contact, contacts):
+        rows += [(*feature, tangential) for tangential in (False, True)[: 1 + rolling]]
+    return Formation(*(jnp.asarray(np.asarray(column)) for column in zip(*rows, strict=True)))
 
 
 def heading(toward: str, until: Mapping[Any, float] | None = None) -> Heading:

@@ -138,14 +138,15 @@ class _Start(_Strict):
     theta2: Finite
 
 
-def _four_sliding(contacts: list[str]) -> list[str]:
+def _four_constraints(contacts: list[str]) -> list[str]:
     rows = [parse_contact(text) for text in contacts]
     if len(set(row[:3] for row in rows)) < len(rows):
         raise ValueError("the same contact stands twice")
-    if any(row[3] for row in rows):
-        raise ValueError("rolling contacts are not supported yet; every contact must slide")
-    if len(rows) != CONSTRAINTS:
-        raise ValueError(f"{len(rows)} constraints; a wire needs exactly {CONSTRAINTS}")
+    rolling = sum(row[3] for row in rows)
+    count = len(rows) + rolling
+    if count != CONSTRAINTS:
+        split = f" ({rolling} rolling, two each; {len(rows) - rolling} sliding, one each)" if rolling else ""
+        raise ValueError(f"{count} constraints{split}; a wire needs exactly {CONSTRAINTS}")
     return contacts
 
 
@@ -163,7 +164,7 @@ def _one_coordinate(until: dict[str, float]) -> dict[str, float]:
 
 class _Phase(_Strict):
     name: str
-    contacts: Annotated[list[str], AfterValidator(_four_sliding)]
+    contacts: Annotated[list[str], AfterValidator(_four_constraints)]
     toward: Annotated[str, AfterValidator(_signed_coordinate)]
     duration: Positive
     until: Annotated[dict[Coordinate, Finite], AfterValidator(_one_coordinate)] | None = None

@@ -22,12 +22,13 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.forces import Arcs, arc, sampled_forces
+from wholearm_jax.forces import MOST_ROLLING, Arcs, arc, linear_slacks, sampled_slacks
 from wholearm_jax.motion import Integration, acceleration, single_step
 from wholearm_jax.reduction import Table
 from wholearm_jax.schedule import Window
 
 STEPS = 2  # solver steps an interval (and a part of it, where it is cut)
+ROWS = 4 + MOST_ROLLING  # slacks a sample
 SAMPLES = 5  # places in a step at which forces are sampled, its ends included
 PARTS = 3  # pieces of the wire that one interval may touch
 LANDINGS = 30  # most Newton steps to the place where an interval is cut
@@ -45,10 +46,11 @@ class Variables(eqx.Module):
 
 
 class Shot(NamedTuple):
-    """Intervals simulated: forces [N] at every sample, the sample's share of the phase (0: none), the speed at the
-    interval's start and inside it in wire lengths a duration, and the state at its end as in `Variables`."""
+    """Intervals simulated: forces' slacks [N] (`forces.linear_slacks`) at every sample, the sample's share of the phase
+    (0: none), the speed at the interval's start and inside it in wire lengths a duration, and the state at its end as
+    in `Variables`."""
 
-    forces: Float[Array, "*intervals samples contacts"]
+    forces: Float[Array, "*intervals samples rows"]
     weight: Float[Array, "*intervals samples"]
     pace: Float[Array, "*intervals steps"]
     end: Float[Array, "*intervals 2"]
@@ -110,7 +112,7 @@ def shoot(table: Table, how: Integration, intervals: int, q: Float[Array, "7"]) 
 
     done = jax.lax.while_loop(lambda at: (at.share < 1) & (at.count < PARTS), one_part, begin)
     steps = _arcs(table, seen, duration, done)
-    forces = sampled_forces(table, seen, duration, steps, SAMPLES).reshape(PARTS * STEPS * SAMPLES, -1)
+    forces = sampled_slacks(table, seen, duration, steps, SAMPLES, linear_slacks).reshape(PARTS * STEPS * SAMPLES, -1)
     weight = jnp.repeat((done.when[:, -1] - done.when[:, 0]) / (STEPS * SAMPLES * intervals), STEPS * SAMPLES)
     y = jnp.where(done.share < 1, jnp.nan, done.y)
     return Shot(

@@ -3,6 +3,7 @@ r"""Quasi-static torques and the bound: what torques within limits can do at one
 For a given motion the equation of motion `A3 tau1 + A4 tau2 = a - A0 - A1 v^2 - A2 v` leaves one free direction of the
 torques, the squeeze. Along it each force is linear, so the best least force lies where two forces meet or at a limit.
 The bound lets the acceleration go free as well; its optimum is a vertex of a linear programme in `(tau1, tau2, m)`.
+Of a contact that rolls, three linear functions of the torque count: `c_n`, `mu c_n - c_t` and `mu c_n + c_t`.
 """
 
 import itertools
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from wholearm_jax.forces import linear_slacks
 from wholearm_jax.reduction import Table, horner, powers
 
 SPEEDS = 12  # speed intervals of the bound
@@ -21,14 +23,14 @@ PLACES = 64
 
 
 class Hold(eqx.Module):
-    """The best torques for a motion at one place: `torque` [N m], least force `margin` [N] (-inf: outside limits)."""
+    """The best torques for a motion at one place: `torque` [N m], least slack `margin` [N] (-inf: outside limits)."""
 
     torque: Float[Array, "2"]
     margin: Float[Array, ""]
 
 
 class Bound(eqx.Module):
-    """No torque within limits keeps every force above `value` [N] for a whole phase: `s` and `share` of the wire say
+    """No torque within limits keeps every slack above `value` [N] for a whole phase: `s` and `share` of the wire say
     where it is tight."""
 
     value: Float[Array, ""]
@@ -37,7 +39,7 @@ class Bound(eqx.Module):
 
 
 def coefficients(table: Table, s: Float[Array, ""]):
-    """Coefficients of `a` (5) and of the forces (contacts x 5) at `s`, in the piece that holds it."""
+    """Coefficients of `a` (5) and of the forces (slots x 5) at `s`, in the piece that holds it."""
     inner = table.breaks[1:-1]
     piece = jnp.minimum((s >= inner).sum(), table.count - 1)
     panel, xi = powers(table, piece, s)
@@ -45,8 +47,9 @@ def coefficients(table: Table, s: Float[Array, ""]):
 
 
 def hold(table: Table, s, v=0.0, a=0.0) -> Hold:
-    """Torques that give the motion `(v, a)` at `s` [1/s, 1/s^2] with the largest least force, in closed form."""
+    """Torques that give the motion `(v, a)` at `s` [1/s, 1/s^2] with the largest least slack, in closed form."""
     motion, force = coefficients(table, s)
+    force = linear_slacks(table, force)
     one = jnp.ones_like(s)
     speed = jnp.stack([one, v**2 * one, v * one])
     pull = motion[3:]
@@ -79,7 +82,7 @@ def holds(table: Table, s, v, a) -> Hold:
 def bound(table: Table, duration: Float[Array, ""], from_rest=True, to_rest=True) -> Bound:
     """An upper bound on the margin of a phase along a wire that starts, and ends, at rest or moving.
 
-    At each of many places the least force is maximised over torques within limits and over speeds up to `FASTEST` wire
+    At each of many places the least slack is maximised over torques within limits and over speeds up to `FASTEST` wire
     lengths a duration (each interval of speeds by its most favourable corner, so that the bound errs upward); at rest
     speed is 0 and the acceleration may point only forward (start) or backward (end). The smallest of these bounds the
     phase.
@@ -89,7 +92,7 @@ def bound(table: Table, duration: Float[Array, ""], from_rest=True, to_rest=True
     places = table.breaks[0] + table.length * jnp.linspace(0.0, 1.0, PLACES + 1)
 
     def moving(s):
-        _, force = coefficients(table, s)
+        force = linear_slacks(table, coefficients(table, s)[1])
 
         def between(low, high):
             square = jnp.maximum(force[:, 1] * low**2, force[:, 1] * high**2)
@@ -100,6 +103,7 @@ def bound(table: Table, duration: Float[Array, ""], from_rest=True, to_rest=True
 
     def resting(s, sign):
         motion, force = coefficients(table, s)
+        force = linear_slacks(table, force)
         return _best(table, force[:, 0], force[:, 3:], sign * motion[3:], sign * motion[0])
 
     values = jax.vmap(moving)(places)
@@ -109,10 +113,10 @@ def bound(table: Table, duration: Float[Array, ""], from_rest=True, to_rest=True
     return Bound(values[k], places[k], k / PLACES)
 
 
-def _rows(contacts: int) -> Int[np.ndarray, "vertices 3"]:
-    """Triples of the constraints (contacts, four limits, the acceleration's sign) that may meet in an optimum."""
-    triples = itertools.combinations(range(contacts + 5), 3)
-    return np.array([t for t in triples if t[0] < contacts])
+def _rows(slacks: int) -> Int[np.ndarray, "vertices 3"]:
+    """Triples of the constraints (slacks, four limits, the acceleration's sign) that may meet in an optimum."""
+    triples = itertools.combinations(range(slacks + 5), 3)
+    return np.array([t for t in triples if t[0] < slacks])
 
 
 def _best(table, offset, slope, pull, push):

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.forces import Score
+from wholearm_jax.forces import Score, slack
 from wholearm_jax.motion import Motion
 from wholearm_jax.reduction import Change, Table
 from wholearm_jax.status import Status
@@ -48,11 +48,12 @@ def judge(table: Table, motion: Motion, score: Score, at_rest: bool, entered: Ch
     lost = jnp.isfinite(score.lost)
     status = jnp.where(lost, int(Status.CONTACT_LOST), finish)
     traced = table.status == 0
-    pulls = entered.impulse.min() < -PULL * jnp.abs(entered.impulse).max()
+    room = slack(table, entered.impulse)  # impulses have the cones of forces
+    pulls = room.min() < -PULL * jnp.abs(entered.impulse).max()
     back = entered.speed < 0
     refused = pulls | back
     early = jnp.where(pulls, int(Status.CONTACT_LOST), int(Status.REVERSED))
-    contact = jnp.where(pulls, jnp.argmin(entered.impulse), jnp.where(lost & ~back, score.lost_contact, -1))
+    contact = jnp.where(pulls, jnp.argmin(room), jnp.where(lost & ~back, score.lost_contact, -1))
     return Verdict(
         status=jnp.where(traced, jnp.where(refused, early, status), table.status),
         share=jnp.where(traced & ~refused, jnp.where(lost, score.lost, share), 0.0),

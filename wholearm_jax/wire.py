@@ -1,6 +1,7 @@
 r"""Trace: the curve `z(s)` on which a formation of four constraints moves, its ends, kinks and nodes.
 
-Four C-functions in five unknowns leave a wire that depends on geometry alone. It is charted by the linear coordinate
+Four C-functions (gaps, and the places where rolling contacts touch) in five unknowns leave a wire that depends on
+geometry alone. It is charted by the linear coordinate
 `s = s_ref + u . (z - z_ref)` (object units, see `system`), `u` being the unit tangent where the chart begins; a wire
 that turns away from `u` continues in a new chart, so turning points of single coordinates are nothing special. The
 search below (march, watch, bracket) runs on constants; every place that it finds is then the root of five equations
@@ -19,7 +20,7 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.contacts import frame, frames, gaps, normal_rows, slip_rows
+from wholearm_jax.contacts import constraint_rows, constraints, frame, frames, placed, slips
 from wholearm_jax.newton import newton
 from wholearm_jax.scene import Heading
 from wholearm_jax.status import Status
@@ -54,14 +55,14 @@ class Wire(eqx.Module):
     end_why: Int[Array, ""]
     end_contact: Int[Array, ""]
     residual: Float[Array, ""]
-    start_gaps: Float[Array, "contacts"]
+    start_gaps: Float[Array, "slots"]
     count: Int[Array, ""]
     breaks: Float[Array, "pieces_1"]
     chart: Float[Array, "pieces 5"]
     anchor: Float[Array, "pieces 5"]
     anchor_s: Float[Array, "pieces"]
     factor: Float[Array, "pieces"]
-    slip_sign: Float[Array, "pieces contacts"]
+    slip_sign: Float[Array, "pieces slots"]
     joint_sign: Float[Array, "pieces 2"]
     first: Int[Array, "pieces"]
     panels: Int[Array, "pieces"]
@@ -85,6 +86,7 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     rough = rough / system.configuration_unit
     until = heading.until_value / system.configuration_unit[heading.until_coordinate]
     heading = eqx.tree_at(lambda h: h.until_value, heading, until)
+    system = eqx.tree_at(lambda s: s.contacts, system, placed(system.contacts, rough))
     fixed, fixed_heading = stop_gradient(system), stop_gradient(heading)
 
     start, residual = _project(system, rough)
@@ -116,7 +118,7 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     return eqx.tree_at(
         lambda w: (w.status, w.residual, w.start_gaps),
         wire,
-        (worst, residual, gaps(fixed.contacts, start) * fixed.length),
+        (worst, residual, constraints(fixed.contacts, start) * fixed.length),
     )
 
 
@@ -124,8 +126,8 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
 
 
 def tangent(system: System, z: Float[Array, "5"], hint: Float[Array, "5"]) -> Float[Array, "5"]:
-    """Unit null vector of `G_n` with a positive component along `hint`."""
-    rows = jnp.concatenate([normal_rows(system.contacts, z), hint[None]])
+    """Unit null vector of `G` with a positive component along `hint`."""
+    rows = jnp.concatenate([constraint_rows(system.contacts, z), hint[None]])
     x = jnp.linalg.solve(rows, jnp.zeros(5, z.dtype).at[4].set(1.0))
     return x / jnp.sqrt(x @ x)
 
@@ -144,20 +146,20 @@ def _project(system, rough):
     fixed, far = stop_gradient(system), stop_gradient(rough)
 
     def least(z):
-        rows = normal_rows(fixed.contacts, z)
-        move = -rows.T @ jnp.linalg.solve(rows @ rows.T, gaps(fixed.contacts, z))
+        rows = constraint_rows(fixed.contacts, z)
+        move = -rows.T @ jnp.linalg.solve(rows @ rows.T, constraints(fixed.contacts, z))
         move = jnp.where(jnp.isfinite(move), move, 0.0)
         return z + move * jnp.minimum(1.0, 0.3 / jnp.maximum(jnp.abs(move).max(), 1e-30))
 
     z = jax.lax.fori_loop(0, 12, lambda _, z: least(z), far)
-    hint = _null(normal_rows(fixed.contacts, z))
+    hint = _null(constraint_rows(fixed.contacts, z))
 
     def nearest(z, system, rough):
-        return jnp.concatenate([gaps(system.contacts, z), (tangent(system, z, hint) @ (z - rough))[None]])
+        return jnp.concatenate([constraints(system.contacts, z), (tangent(system, z, hint) @ (z - rough))[None]])
 
     root = newton(nearest, z, system, rough)
     near = jnp.where(root.residual < 1e-6, root.z, z)
-    return near, jnp.abs(gaps(fixed.contacts, stop_gradient(near))).max()
+    return near, jnp.abs(constraints(fixed.contacts, stop_gradient(near))).max()
 
 
 def _misplaced(system, z):
@@ -178,7 +180,7 @@ def _null(rows):
 
 def _oriented(system, z, heading):
     """The unit tangent at `z` whose coordinate `heading.coordinate` has the sign asked for."""
-    null = _null(normal_rows(system.contacts, z))
+    null = _null(constraint_rows(system.contacts, z))
     return null * jnp.where(null[heading.coordinate] * heading.sign < 0, -1.0, 1.0)
 
 
@@ -295,8 +297,8 @@ def _correct(system, u, z, height, steps=4):
 
     def once(_, state):
         z, _ = state
-        rows = jnp.concatenate([normal_rows(system.contacts, z), u[None]])
-        left = jnp.concatenate([gaps(system.contacts, z), (u @ z - height)[None]])
+        rows = jnp.concatenate([constraint_rows(system.contacts, z), u[None]])
+        left = jnp.concatenate([constraints(system.contacts, z), (u @ z - height)[None]])
         move = jnp.linalg.solve(rows, left)
         return z - move, jnp.abs(move).max()
 
@@ -353,7 +355,7 @@ def _fifth(system, heading, march, z, hint, plane):
     ending = jnp.where(march.end < pairs, frame(made, z).gap, others[jnp.maximum(march.end - pairs, 0)])
     still = hint @ (z - plane)
     return jnp.concatenate(
-        [slip_rows(system.contacts, z) @ x, x[3:], still[None], jnp.where(march.end < 0, still, ending)[None]]
+        [slips(system.contacts, z, x), x[3:], still[None], jnp.where(march.end < 0, still, ending)[None]]
     )
 
 
@@ -362,7 +364,7 @@ def _places(system, heading, march, resolution):
     fixed = stop_gradient(system)
     rows = jnp.arange(MAX_MARCH)
     live = rows < march.n
-    reversing = jax.vmap(lambda z, x: jnp.concatenate([slip_rows(fixed.contacts, z) @ x, x[3:]]))(march.z, march.x)
+    reversing = jax.vmap(lambda z, x: jnp.concatenate([slips(fixed.contacts, z, x), x[3:]]))(march.z, march.x)
     flips, share = _flips(reversing, live)
     turns = live & (rows > 0) & (march.chart != jnp.roll(march.chart, 1))
     found = jnp.concatenate([flips, turns[:, None]], axis=1)
@@ -386,7 +388,7 @@ def _places(system, heading, march, resolution):
 
         def equations(z, system, heading):
             fifth = _fifth(system, heading, march, z, hint, guess)[what]
-            return jnp.concatenate([gaps(system.contacts, z), fifth[None]])
+            return jnp.concatenate([constraints(system.contacts, z), fifth[None]])
 
         root = newton(equations, guess, system, heading)
         return root.z, root.residual, _coordinate(march, chart, root.z)
@@ -405,7 +407,7 @@ def _branches(system, march, end, astray):
     """Whether the wire meets another one on its way: `det [G_n; x]`, the product of singular values, changes sign."""
 
     def orientation(z, x):
-        return jnp.linalg.det(jnp.concatenate([normal_rows(system.contacts, z), x[None]]))
+        return jnp.linalg.det(jnp.concatenate([constraint_rows(system.contacts, z), x[None]]))
 
     rows, last = jnp.arange(MAX_MARCH), jnp.maximum(march.n - 1, 0)
     along = jax.vmap(orientation)(march.z, march.x)
@@ -475,9 +477,9 @@ def _cut(system, fixed, march, places, start, resolution):
         z, moved = _correct(fixed, u, guess, stop_gradient(height), steps=3)
 
         def equations(z, system, height):
-            return jnp.concatenate([gaps(system.contacts, z), (u @ z - height)[None]])
+            return jnp.concatenate([constraints(system.contacts, z), (u @ z - height)[None]])
 
-        rows = jnp.concatenate([normal_rows(fixed.contacts, stop_gradient(z)), u[None]])
+        rows = jnp.concatenate([constraint_rows(fixed.contacts, stop_gradient(z)), u[None]])
         return z - jnp.linalg.solve(stop_gradient(rows), equations(stop_gradient(z), system, height)), moved
 
     per_panel = jax.vmap(node, (0, 0, None, None, None))
@@ -545,7 +547,7 @@ def _signs(system, nodes, chart, owner, resolution):
 
     def speeds(z, u):
         x = tangent(system, z, u)
-        return jnp.concatenate([slip_rows(system.contacts, z) @ x, x[3:]])
+        return jnp.concatenate([slips(system.contacts, z, x), x[3:]])
 
     values = jax.vmap(jax.vmap(speeds, (0, None)))(nodes, chart[owner])
     total = jax.ops.segment_sum(values.sum(1), owner, resolution.pieces)
