@@ -1,0 +1,236 @@
+"""Scenes at the edge: wires that turn far or meet another, wedging on the way back, tiny pieces, many stops."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_gradients import nearest_difference
+
+import wholearm_jax as wa
+from wholearm_jax.contacts import gaps
+from wholearm_jax.forces import arc
+from wholearm_jax.motion import Integration, move
+from wholearm_jax.plan import end_configuration, outcomes, prepare
+from wholearm_jax.reduction import balance, blank, horner, powers
+from wholearm_jax.scene import body
+from wholearm_jax.schedule import window
+from wholearm_jax.squeeze import hold, holds
+from wholearm_jax.system import system
+from wholearm_jax.wire import Resolution
+
+
+def scene(vertices, contacts, toward, start, *, joint, length, offset=(0.0, 0.0)):
+    """A scene of one phase on a hand with two like fingers."""
+    alike = {"length": length, "inertia": 0.3, "viscous": 0.05, "dry": 0.02, "torque_limit": 100.0}
+    places = zip(("finger1", "finger2"), joint, offset, strict=True)
+    return wa.parse(
+        {
+            "title": "edge",
+            "gravity": 9.81,
+            "hand": {name: alike | {"joint": [x, 0.0], "offset": away} for name, x, away in places},
+            "object": {"vertices": vertices, "mass": 1.0, "friction": 0.2},
+            "start": dict(zip(("x", "y", "phi", "theta1", "theta2"), start, strict=True)),
+            "phase": [
+                {"name": "p", "contacts": contacts, "toward": toward, "duration": 2.0, "arrive": "moving"},
+            ],
+        }
+    )
+
+
+def mechanics(scene):
+    return system(body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)
+
+
+def turning():
+    """A wire that turns so far that one chart does not reach its end; between the charts' meeting and the next reversal
+    lies a short piece."""
+    return scene(
+        [[-0.32, 0.61], [-0.97, -0.25], [0.55, -0.53], [0.9, 0.15]],
+        ["finger1:v3", "finger2:v0", "palm:v1", "finger1:v2"],
+        "phi-",
+        [-0.332, 0.997, 1.245, 2.339, 1.472],
+        joint=(1.97, -1.32),
+        length=6.7,
+    )
+
+
+def test_a_wire_may_turn_far():
+    """Charts follow each other: closure holds on both sides, `z` and `z_dot` are continuous where they meet."""
+    at = wa.trace(turning())[0]
+    table, wire, formation = at.table, at.wire, mechanics(turning())
+    assert int(table.status) == wa.Status.OK
+    charts = np.asarray(wire.chart)[: int(table.count)]
+    met = [k for k in range(1, len(charts)) if np.any(charts[k] != charts[k - 1])]
+    assert met, "the wire stays in one chart: it is no test"
+
+    def read(piece, s):
+        panel, xi = powers(table, jnp.asarray(piece), s)
+        unit = formation.configuration_unit
+        return horner(table.configuration[panel], xi) / unit, horner(table.velocity[panel], xi) / unit
+
+    for k in met:
+        before, after = read(k - 1, table.breaks[k]), read(k, table.breaks[k])
+        assert np.abs(before[0] - after[0]).max() < 1e-12
+        assert np.abs(before[1] - table.factor[k] * after[1]).max() < 1e-10
+        assert float(table.factor[k]) > 1.1
+    for piece in range(len(charts)):
+        for s in np.linspace(float(table.breaks[piece]), float(table.breaks[piece + 1]), 9):
+            assert float(jnp.abs(gaps(formation.contacts, read(piece, jnp.asarray(s))[0])).max()) < 1e-10
+
+
+def test_derivatives_pass_from_chart_to_chart():
+    """Place, time and force at the end of a motion through both charts, against differences.
+
+    Only what does not depend on the charts can be compared: they change with the scene themselves.
+    """
+    edge = turning()
+    table = wa.trace(edge)[0].table
+    knots = np.linspace(0.0, 2.0, 7)
+    u = jnp.asarray(knots / 1.6)
+    places = table.length * jnp.minimum(u, 1.0) ** 2
+    rate = 1 / 1.6
+    held = holds(table, places, 2 * table.length * u * rate, jnp.full(7, 2 * table.length * rate**2))
+    schedule = wa.torque(knots, held.torque)
+    how = Integration(adjoint="forward", tolerance=1e-12)
+
+    def outcome(h):
+        hand = eqx.tree_at(lambda hand: hand.length, edge.hand, edge.hand.length + jnp.array([h, 0.5 * h]))
+        solid = eqx.tree_at(lambda b: b.vertices, edge.object, edge.object.vertices + h * jnp.array([[0.3, -0.2]]))
+        moved = eqx.tree_at(lambda s: (s.hand, s.object), edge, (hand, solid))
+        moved = eqx.tree_at(lambda s: s.hand.offset, moved, moved.hand.offset + jnp.array([0.2 * h, h]))
+        at = wa.trace(moved)
+        found = outcomes(moved, schedule, at, how)[0]
+        share = found.motion.share[found.motion.count]
+        return jnp.concatenate([end_configuration(at[0]), jnp.stack([share, found.score.margin])])
+
+    value, slope = jax.jvp(outcome, (jnp.asarray(0.0),), (jnp.asarray(1.0),))
+    assert 0.5 < float(value[5]) < 1.0, "it does not arrive"
+    assert np.abs(slope).min() > 1e-3
+    for k in range(len(slope)):
+        numeric = nearest_difference(lambda h, k=k: float(outcome(jnp.asarray(h))[k]), float(slope[k]))
+        assert float(slope[k]) == pytest.approx(numeric, rel=1e-6)
+
+
+def test_a_wire_that_meets_another_is_singular():
+    """A finger's edge flush with the object, held by a vertex and the tip: where the two meet, they are one contact."""
+    flush = scene(
+        [[0.5708, 0.3954], [-0.9376, 0.2421], [-0.6901, -0.3374], [0.9554, -0.2954]],
+        ["finger1:v1", "palm:v0", "finger2:v3", "finger1:e0"],
+        "x+",
+        [0.3358, 0.5621, -2.804, 0.7572, 1.4],
+        joint=(0.6971, -0.7538),
+        length=0.881,
+        offset=(0.05339, 0.0),
+    )
+    assert int(wa.trace(flush)[0].table.status) == wa.Status.SINGULAR
+
+
+def test_wedging_on_the_way_back_does_not_spoil_the_table():
+    """Backward accelerations keep their sign through a place where friction would wedge an object going back."""
+    name = wa.load("heptagon")
+    end = end_configuration(wa.trace(name)[1])
+    rough = eqx.tree_at(lambda s: s.object.friction, name, jnp.full(3, 0.7))
+    phase = rough.phases[1]
+    heading = eqx.tree_at(lambda h: h.sign, phase.heading, -phase.heading.sign)
+    solid = body(rough.object)
+    at = prepare(solid, rough.hand, rough.gravity, phase.formation, end, heading)
+    table, wire = at.table, at.wire
+    assert int(table.status) == wa.Status.OK
+    assert float(table.error) < 1e-9
+    formation = system(solid, rough.hand, rough.gravity, phase.formation)
+    turned = []
+    for s in np.linspace(0.02, 0.98, 60) * float(table.length):
+        piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
+        panel, xi = powers(table, piece, jnp.asarray(s))
+        z = horner(table.configuration[panel], xi) / formation.configuration_unit
+        x = horner(table.velocity[panel], xi) / formation.configuration_unit
+        signs = wire.slip_sign[piece], wire.joint_sign[piece]
+        back, right = balance(formation, z, x, 0 * x, -signs[0], -signs[1])
+        smooth, _ = balance(formation, z, x, 0 * x, 0 * signs[0], signs[1])
+        turned.append(float(jnp.linalg.det(back) * jnp.linalg.det(smooth)))
+        exact = jnp.linalg.solve(back, right)[0, jnp.array([0, 3, 4])]
+        np.testing.assert_array_equal(np.sign(horner(table.backward[panel], xi)), np.sign(exact))
+    assert min(turned) < 0 < max(turned), "nothing wedges: it is no test"
+
+
+class _Track(NamedTuple):
+    """A table of straight pieces without any acceleration, and a schedule without torque."""
+
+    table: object
+    seen: object
+
+
+def track(breaks, factor, knots=2):
+    """Pieces that end at `breaks`, at whose beginnings `ds/dt` is multiplied by `factor`."""
+    table = blank(Resolution(len(factor), len(factor), 4))
+    rows = jnp.arange(len(factor))
+    table = eqx.tree_at(
+        lambda t: (t.breaks, t.count, t.factor, t.first),
+        table,
+        (jnp.asarray(breaks), jnp.asarray(len(factor)), jnp.asarray(factor), rows),
+    )
+    schedule = wa.torque(np.linspace(0.0, 1.0, knots), np.zeros((knots, 2)))
+    seen = window(schedule, jnp.asarray(0.0), jnp.asarray(1.0))
+    return _Track(table, seen)
+
+
+def test_a_piece_crossed_in_one_step_keeps_its_speed():
+    """Behind a change of chart the step that already passes the next one starts at the new chart's speed."""
+    table, seen = track([0.0, 1.0, 1.001, 99.0], [1.0, 2.0, 3.0])
+    motion = move(table, seen, jnp.asarray(1.0), how=Integration(), speed=4.0)
+    last = int(motion.count)
+    assert float(motion.w[last]) == pytest.approx(24.0, rel=1e-12)
+    assert float(motion.share[last]) == 1.0
+    time = 1.0 / 4 + 0.001 / 8
+    assert float(motion.s[last]) == pytest.approx(1.001 + 24.0 * (1 - time), rel=1e-12)
+
+
+def test_a_step_as_short_as_rounding_keeps_its_speed():
+    table, seen = track([0.0, 1.0], [1.0])
+    here, now = 0.6460973036766916, 0.8463721297745421
+    share = jnp.array([now, np.nextafter(now, 1.0)])
+    s = jnp.array([here, np.nextafter(np.nextafter(here, 1.0), 1.0)])
+    quintic = arc(table, seen, jnp.asarray(1.0), share, s, jnp.array([1.5, 1.5]), 0, 0, True)
+    slope = np.polynomial.polynomial.polyder(np.asarray(quintic))
+    speed = np.polynomial.polynomial.polyval(np.linspace(0, 1, 7), slope) / float(share[1] - share[0])
+    np.testing.assert_allclose(speed, 1.5, rtol=1e-12)
+
+
+def test_too_few_steps_are_always_said():
+    """A phase of several pieces that needs more steps than the record holds says `max_steps`, or is right."""
+    table, seen = track([0.0, 1.0, 2.0, 99.0], [1.0, 1.0, 1.0], knots=9)
+    whole = move(table, seen, jnp.asarray(1.0), how=Integration(), speed=4.0)
+    needed = int(whole.count)
+    assert needed > 9
+    short = jax.jit(move, static_argnames=("how", "speed"))
+    said = []
+    for most in range(3, needed + 2):
+        motion = short(table, seen, jnp.asarray(1.0), how=Integration(max_steps=most), speed=4.0)
+        said.append(int(motion.status) == wa.Status.MAX_STEPS)
+        if not said[-1]:
+            assert float(motion.s[motion.count]) == pytest.approx(4.0, rel=1e-12)
+            assert float(motion.share[motion.count]) == 1.0
+    assert said[0]
+    assert not said[-1]
+
+
+def test_a_motion_may_stop_and_go_on_often():
+    """Pushes and pauses, twelve of each: more stages than a phase usually has."""
+    slide = wa.load("heptagon")
+    table = wa.trace(slide)[0].table
+    push = np.asarray(hold(table, table.breaks[0], 0.0, 3.0).torque)
+    brake = np.asarray(hold(table, table.breaks[0], 0.0, -6.0).torque)
+    cycle = np.stack([push, push, brake, brake, brake, brake])
+    ticks = np.array([0.0, 1.0, 1.0, 2.0, 2.0, 4.0]) / 4
+    times = np.concatenate([(k + ticks) / 12 for k in range(12)])
+    values = np.tile(cycle, (12, 1))
+    keep = np.concatenate([[True], np.diff(times) >= 0])
+    times, first = times[keep], values[keep]
+    # No time more than twice: the step at 2.0 repeats the row before it.
+    unique = np.concatenate([[True], ~((np.diff(times) == 0) & np.all(np.diff(first, axis=0) == 0, axis=1))])
+    schedule = wa.torque(times[unique], first[unique])
+    result = wa.simulate(eqx.tree_at(lambda s: s.phases, slide, slide.phases[:1]), schedule)
+    assert result.phases[0].status is not wa.Status.MAX_STEPS
