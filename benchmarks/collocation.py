@@ -143,15 +143,22 @@ def best_known(table: Table, duration: float, coarse: Collocated, *, enough: flo
     """The largest margin that collocation finds with the same knots, whatever it costs, or one of `enough` newtons.
 
     Each interval between knots is divided, into `FINE` or more in all, so that forces are held at many times and the
-    simulated margin is close to the programme's. Reversals are searched widely, from the minimum-jerk motion, the one
-    that can be squeezed hardest and the coarse solution: the optima that they lead to differ.
+    simulated margin is close to the programme's. Reversals are searched widely, from four starts that lead to different
+    optima: the minimum-jerk motion, the one that can be squeezed hardest, the coarse solution, and the best coarse
+    solution over all intervals in which a reversal may lie.
     """
-    intervals = len(coarse.torque) - 1
-    phase = Phase(read(table), duration, intervals + 1, -(-FINE // intervals))
-    bells = (_course(table, phase, bell) for bell in (MINIMUM_JERK, _hardest(table, duration)))
+    knots = len(coarse.torque)
+    rough = Phase(read(table), duration, knots, 1)
+    phase = rough._replace(refine=-(-FINE // rough.intervals))
+    starts = [
+        lambda: _course(table, phase, MINIMUM_JERK),
+        lambda: _course(table, phase, _hardest(table, duration)),
+        lambda: coarse.course,
+        lambda: _scanned(rough, coarse.course),
+    ]
     found: list[Collocated] = []
-    for start in (*bells, coarse.course):
-        found.append(_collected(table, phase, _explored(phase, start, QUICKER)))
+    for start in starts:
+        found.append(_collected(table, phase, _explored(phase, start(), QUICKER)))
         if found[-1].succeeded and found[-1].margin >= enough:
             break
     return max(found, key=lambda one: (one.succeeded, one.margin))
@@ -464,6 +471,17 @@ def _explored(phase: Phase, course: Course, options: dict[str, Any]) -> list[Sol
         done.append(_once(phase, best.course, *waiting.pop(0), options))
         best = max(done, key=lambda one: one.rank)
     return done
+
+
+def _scanned(phase: Phase, course: Course) -> Course:
+    """The best course with each reversal in turn tried in every interval."""
+    for k in range(len(phase.wire.pieces) - 1):
+        rows, splits = _passed(phase, course)
+        tries = [(*rows[:k], row, *rows[k + 1 :]) for row in range(phase.intervals)]
+        solves = [_once(phase, course, one, splits, QUICKER) for one in tries if list(one) == sorted(one)]
+        best = max(solves, key=lambda one: one.rank)
+        course = best.course if best.course.least > course.least else course
+    return course
 
 
 def _beside(phase: Phase, solve: Solve, step: np.ndarray) -> tuple[tuple[int, ...], np.ndarray] | None:

@@ -1,0 +1,168 @@
+r"""The direct way, to compare with: the C-functions are solved by Newton's method inside the vector field.
+
+State `(s, w)` as in `wholearm_jax.motion`; at every stage of every step
+
+    C_n(z) = 0,  u . z = s            Newton's method, from the nearest of a few places known on the wire,
+    G_n x = 0,  u . x = 1             the wire's tangent, and its derivative x',
+    [ M x , -(G_n - Xi U G_t)^T ] [a ; c_n] = E tau + g - M x' v^2 - B x v - D sgn(x v)
+
+and nothing is tabulated. Torque knots, slip reversals and the wire's end are treated as the package treats them, so
+that the order is kept: steps end on knots, and the step that passes a reversal is taken again with the length that
+lands on it. Where they lie on the wire is given for free; waiting and friction at rest are left out.
+"""
+
+from typing import NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from wholearm_jax.contacts import gaps
+from wholearm_jax.newton import newton
+from wholearm_jax.reduction import Table, along_wire, balance, horner, powers
+from wholearm_jax.schedule import Window, interval, torque_in
+from wholearm_jax.system import System
+from wholearm_jax.wire import Wire
+
+PLACES = 33  # known places of the wire: Newton's method starts within a sixty-fourth of its length
+
+
+class Direct(eqx.Module):
+    """What the direct way knows of a wire: its chart, signs, where its pieces end, and a few places to start from."""
+
+    system: System
+    chart: Float[Array, "5"]
+    anchor: Float[Array, "5"]
+    anchor_s: Float[Array, ""]
+    slip_sign: Float[Array, "pieces contacts"]
+    joint_sign: Float[Array, "pieces 2"]
+    breaks: Float[Array, "pieces_1"]
+    s: Float[Array, "places"]
+    z: Float[Array, "places 5"]
+    x: Float[Array, "places 5"]
+
+
+class Path(NamedTuple):
+    """Accepted steps of each piece, `count[k]` of them: rows (share, s, w), the piece's start not among them."""
+
+    steps: Float[Array, "pieces steps 3"]
+    count: Int[Array, "pieces"]
+
+
+def direct(system: System, wire: Wire, table: Table) -> Direct:
+    """The direct way's view of a wire of one chart."""
+    pieces = int(table.count)
+    if not np.all(np.asarray(wire.chart[:pieces]) == np.asarray(wire.chart[0])):
+        raise ValueError("the direct way is written for wires of one chart")
+    s = jnp.linspace(wire.breaks[0], wire.breaks[pieces], PLACES)
+
+    def place(s):
+        piece = jnp.minimum((s >= wire.breaks[1:pieces]).sum(), pieces - 1)
+        panel, xi = powers(table, piece, s)
+        z = horner(table.configuration[panel], xi) / system.configuration_unit
+        return z, along_wire(system, z, wire.chart[0])[0]
+
+    z, x = jax.vmap(place)(s)
+    signs = wire.slip_sign[:pieces], wire.joint_sign[:pieces]
+    return Direct(system, wire.chart[0], wire.anchor[0], wire.anchor_s[0], *signs, wire.breaks[: pieces + 1], s, z, x)
+
+
+def solve(way: Direct, piece, s, w, tau, duration):
+    """`z`, `x`, `a` and `c_n` [N] at one state, from nothing but the C-functions and the 5x5 system."""
+    near = jnp.argmin(jnp.abs(way.s - s))
+    height = way.chart @ way.anchor + s - way.anchor_s
+
+    def equations(z):
+        return jnp.concatenate([gaps(way.system.contacts, z), (way.chart @ z - height)[None]])
+
+    z = newton(equations, way.z[near] + way.x[near] * (s - way.s[near])).z
+    x, bend = along_wire(way.system, z, way.chart)
+    matrix, right = balance(way.system, z, x, bend, way.slip_sign[piece], way.joint_sign[piece])
+    v = w / duration
+    terms = jnp.concatenate([jnp.stack([jnp.ones_like(v), v**2, v]), tau / way.system.torque_unit])
+    answer = jnp.linalg.solve(matrix, right @ terms)
+    return z, x, answer[0], answer[1:] * way.system.force_unit
+
+
+@eqx.filter_jit
+def move(way: Direct, seen: Window, duration, solver: dfx.AbstractSolver, tolerance, max_steps: int) -> Path:
+    """Move from rest at the wire's start to its end or to the end of time."""
+    share, y = jnp.zeros(()), jnp.stack([way.breaks[0], jnp.zeros(())])
+    steps, counts = [], []
+    for piece in range(way.slip_sign.shape[0]):
+        solution = _until(way, seen, duration, solver, tolerance, max_steps, piece, share, y)
+        taken, passed = solution.stats["num_accepted_steps"], dfx.is_event(solution.result)
+        rows = jnp.concatenate([solution.ts[:, None], solution.ys], axis=1)
+        before = jnp.where(taken > 1, rows[jnp.maximum(taken - 2, 0)], jnp.concatenate([share[None], y]))
+        landed = _land(way, seen, duration, solver, piece, before, rows[taken - 1, 0], way.breaks[piece + 1])
+        last = jnp.where(passed, landed, rows[taken - 1])
+        steps.append(rows.at[taken - 1].set(last))
+        # Where time is over in an earlier piece there is nothing left to do.
+        counts.append(jnp.where(share < 1, taken, 0))
+        share, y = jnp.where(passed, last[0], 1.0), last[1:]
+    return Path(jnp.stack(steps), jnp.stack(counts))
+
+
+@eqx.filter_jit
+def states(way: Direct, seen: Window, duration, path: Path):
+    """`z` and `z_dot` (SI) and `c_n` [N] at every step of a path."""
+
+    def one(piece, row):
+        share, s, w = row
+        # A step that ends on a knot belongs to the interval before it; the torque is continuous.
+        tau = torque_in(seen, interval(seen, share), share)
+        z, x, _, cn = solve(way, piece, s, w, tau, duration)
+        unit = way.system.configuration_unit
+        return z * unit, x * w / duration * unit, cn
+
+    pieces = jnp.arange(path.count.shape[0])
+    return jax.vmap(jax.vmap(one, (None, 0)))(pieces, path.steps)
+
+
+def _field(way, seen, duration, piece, row):
+    def field(u, y, args):
+        tau = torque_in(seen, interval(seen, u) if row is None else row, u)
+        return jnp.stack([y[1], duration**2 * solve(way, piece, y[0], y[1], tau, duration)[2]])
+
+    return dfx.ODETerm(field)
+
+
+def _until(way, seen, duration, solver, tolerance, max_steps, piece, share, y):
+    """Steps until the first that passes the piece's end, or to the end of time."""
+    errors = dfx.PIDController(rtol=tolerance, atol=tolerance)
+    return dfx.diffeqsolve(
+        _field(way, seen, duration, piece, None),
+        solver,
+        jnp.minimum(share, 1 - 1e-9),
+        1.0,
+        1 / 32,
+        y,
+        saveat=dfx.SaveAt(steps=True),
+        stepsize_controller=dfx.ClipStepSizeController(errors, step_ts=seen.share),
+        event=dfx.Event(lambda t, y, args, **_: y[0] > way.breaks[piece + 1]),
+        adjoint=dfx.DirectAdjoint(),
+        max_steps=max_steps,
+        throw=False,
+    )
+
+
+def _land(way, seen, duration, solver, piece, before, end, goal):
+    """The step from `before` with the length, found by Newton's method, that lands on `s = goal`."""
+    share, y = before[0], before[1:]
+    term = _field(way, seen, duration, piece, interval(seen, (share + end) / 2))
+    solver = eqx.tree_at(lambda x: x.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)
+
+    def step(length):
+        state = solver.init(term, share, share + length, y, None)
+        return solver.step(term, share, share + length, y, None, state, made_jump=True)[0]
+
+    def narrow(_, length):
+        at = step(length)
+        return jnp.clip(length + (goal - at[0]) / at[1], 0.0, end - share)
+
+    length = jax.lax.fori_loop(0, 8, narrow, (end - share) / 2)
+    at = step(length)
+    return jnp.stack([share + length, goal, at[1]])

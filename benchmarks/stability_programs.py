@@ -1,0 +1,233 @@
+"""The package's own steps on a batch of random scenes: trace, reduce, simulate, score, judge, and what they found.
+
+Each step is the public function of its module under one `vmap`: nothing is skipped and nothing is softened. Beside the
+outcome, the tables are read at places and times for `stability_checks` to look at.
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from stability_scenes import Scenes
+
+from wholearm_jax.forces import arcs, force, on_arc, score
+from wholearm_jax.motion import Integration, acceleration, move
+from wholearm_jax.reduction import Table, change, horner, powers, reduce_wire
+from wholearm_jax.scene import Formation, Hand, Heading, Polygon, body
+from wholearm_jax.schedule import Torque, torque_in, window
+from wholearm_jax.squeeze import holds
+from wholearm_jax.system import configuration_unit, system
+from wholearm_jax.verdict import judge
+from wholearm_jax.wire import Resolution, Wire, trace_wire
+
+PLACES = np.concatenate([[0.0], (np.arange(30) + 0.5) / 30 + 0.01 * np.sin(np.arange(30.0)), [1.0]])
+TIMES = (np.arange(9) + 0.5) / 9
+GAUSS = np.polynomial.legendre.leggauss(4)
+
+
+class Followed(NamedTuple):
+    """What became of a scene's phase, and its tables read along the wire, at times, and within steps (SI units)."""
+
+    torque: Torque
+    status: Float[Array, ""]
+    moving_status: Float[Array, ""]
+    margin: Float[Array, ""]
+    margin_share: Float[Array, ""]
+    lost: Float[Array, ""]
+    lost_contact: Float[Array, ""]
+    ended: Float[Array, ""]
+    share: Float[Array, ""]
+    s: Float[Array, ""]
+    length: Float[Array, ""]
+    w: Float[Array, ""]
+    count: Float[Array, ""]
+    rest: Float[Array, ""]
+    departs: Float[Array, ""]
+    moved: Float[Array, ""]
+    along: dict
+    at: dict
+    ends: dict
+    seam: Float[Array, ""]
+    within: dict
+    finite: Float[Array, ""]
+
+
+def mechanics(scene: Scenes):
+    """The package's system and heading of one scene."""
+    shape = Polygon(scene.vertices, scene.count, scene.mass, scene.friction)
+    solid = body(shape)
+    solid = eqx.tree_at(lambda b: b.inertia, solid, jnp.where(scene.uniform, solid.inertia, scene.inertia))
+    hand = Hand(
+        scene.joint, scene.length, scene.offset, scene.joint_inertia, scene.viscous, scene.dry, scene.torque_limit
+    )
+    formation = Formation(scene.link, scene.kind, scene.feature, scene.tangential)
+    heading = Heading(scene.coordinate, scene.sign, scene.until_coordinate, scene.until_value)
+    return system(solid, hand, scene.gravity, formation), heading
+
+
+def solid_vertices(scene: Scenes):
+    """An object's vertices about its centre of mass."""
+    return body(Polygon(scene.vertices, scene.count, scene.mass, scene.friction)).vertices
+
+
+def prepare(scene: Scenes, resolution: Resolution) -> tuple[Wire, Table]:
+    """Trace and reduce one scene."""
+    formation, heading = mechanics(scene)
+    wire = trace_wire(formation, scene.rough, heading, resolution)
+    return wire, reduce_wire(formation, wire)
+
+
+def drive(table: Table, scene: Scenes) -> Torque:
+    """A schedule for one scene, by `torque_kind`: 0, the best squeeze for a steady acceleration that passes the wire in
+    1 / `pace` of the duration, disturbed by `noise`; 1, random within the limits; 2, a thousand times that; 3, a
+    millionth of it."""
+    u = scene.pace * scene.knots
+    one, rate, length = jnp.ones_like(u), scene.pace / scene.duration, table.length
+    places = table.breaks[0] + length * jnp.minimum(u, 1.0) ** 2
+    squeezed = holds(table, places, 2 * length * u * rate, 2 * length * rate**2 * one).torque * (1 + scene.noise)
+    random = scene.torque_limit * scene.noise
+    kinds = [scene.torque_kind == k for k in range(3)]
+    values = jnp.select(kinds, [squeezed, random, 1e3 * random], 1e-6 * random)
+    return Torque(scene.knots * scene.duration, jnp.where(jnp.isfinite(values), values, 0.0))
+
+
+def follow(wire: Wire, table: Table, scene: Scenes, how: Integration) -> Followed:
+    """Simulate, score and judge one scene from rest, and read the results where the checks want them."""
+    schedule = drive(table, scene)
+    seen = window(schedule, jnp.zeros_like(scene.duration), scene.duration)
+    motion = move(table, seen, scene.duration, how=how)
+    found = score(table, seen, scene.duration, motion, how)
+    entered = change(table, jnp.zeros_like(scene.rough))
+    verdict, moving = (judge(table, motion, found, at_rest, entered) for at_rest in (True, False))
+    end, s, w = (values[motion.count] for values in (motion.share, motion.s, motion.w))
+    steps = arcs(table, seen, scene.duration, motion)
+    unit = configuration_unit(jnp.sqrt((solid_vertices(scene) ** 2).sum(1).max()))
+    last = jnp.maximum(motion.count - 1, 0)
+    rest = jnp.where(motion.held[last] & (motion.count > 0), motion.share[last], end)
+
+    def read(piece, s):
+        panel, xi = powers(table, piece, s)
+
+        def velocity(s):
+            panel, xi = powers(table, piece, s)
+            return horner(table.velocity[panel], xi)
+
+        x, bend = jax.jvp(velocity, (s,), (jnp.ones_like(s),))
+        z = horner(table.configuration[panel], xi)
+        return {"z": z, "x": x, "bend": bend, "slip": wire.slip_sign[piece], "joint": wire.joint_sign[piece]}
+
+    def place(share):
+        s = table.breaks[0] + table.length * share
+        piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
+        panel, xi = powers(table, piece, s)
+        tables = {"acceleration": horner(table.acceleration[panel], xi), "force": horner(table.force[panel], xi)}
+        tables |= {"chart": wire.chart[piece]}
+        return read(piece, s) | tables
+
+    def state(step, xi):
+        arc = jax.tree.map(lambda a: a[step], steps)
+        share, s, w = on_arc(arc, xi)
+        bend = acceleration(table, seen, scene.duration, arc.piece, arc.row, share, s, w)
+        motion = {"v": w / scene.duration, "a": bend / scene.duration**2, "share": share}
+        pushed = force(table, seen, scene.duration, arc.piece, arc.row, share, s, w)
+        motion |= {"torque": torque_in(seen, arc.row, share), "force": pushed}
+        return read(arc.piece, s) | motion | {"held": arc.held | ~arc.live}
+
+    def moment(share):
+        step = jnp.clip((share >= motion.share).sum() - 1, 0, last)
+        width = motion.share[step + 1] - motion.share[step]
+        xi = (share - motion.share[step]) / jnp.where(width > 0, width, 1.0)
+        return state(step, jnp.clip(xi, 0.0, 1.0))
+
+    def node(k):
+        step = jnp.where(k == 0, 0, last)
+        fields = read(motion.piece[step], motion.s[k])
+        entered = motion.entry_w[0]
+        return fields | {"v": jnp.where(k == 0, entered, motion.w[k]) / scene.duration}
+
+    def seam(k):
+        """How far `z` and `z_dot` jump where piece `k` meets the next one."""
+        here, there = (read(piece, table.breaks[k + 1]) for piece in (k, k + 1))
+        jumps = jnp.stack([there["z"] - here["z"], there["x"] * table.factor[k + 1] - here["x"]]) / unit
+        return jnp.where(k + 1 < table.count, jnp.abs(jumps).max(), 0.0)
+
+    tension = jnp.where(jnp.isfinite(found.lost), found.lost, 0.0)
+    shares = jnp.concatenate([end * TIMES, tension * (1 + 1e-7 * jnp.array([-1.0, 1.0]))]).astype(end.dtype)
+    nodes = jnp.arange(how.max_steps)
+    xi = jnp.asarray((GAUSS[0] + 1) / 2, end.dtype)
+    parts = (table.acceleration, table.force, table.configuration, table.velocity, motion.s, motion.w, motion.share)
+    return Followed(
+        torque=schedule,
+        status=jnp.where(scene.at_rest, verdict.status, moving.status),
+        moving_status=moving.status,
+        margin=found.margin,
+        margin_share=found.share,
+        lost=found.lost,
+        lost_contact=found.lost_contact,
+        ended=motion.status,
+        share=end,
+        s=s - table.breaks[0],
+        length=table.length,
+        w=w,
+        count=motion.count,
+        rest=rest,
+        departs=jnp.where(motion.held[0], motion.share[1], 0.0),
+        moved=jnp.any(~motion.held & (nodes < motion.count)),
+        along=jax.vmap(place)(jnp.asarray(PLACES, end.dtype)),
+        at=jax.vmap(moment)(shares),
+        ends=jax.vmap(node)(jnp.stack([jnp.zeros_like(motion.count), motion.count])),
+        seam=jax.vmap(seam)(jnp.arange(table.factor.shape[0] - 1)).max(),
+        within=jax.vmap(jax.vmap(state, (None, 0)), (0, None))(nodes, xi)
+        | {"width": jnp.where(nodes < motion.count, motion.share[1:] - motion.share[:-1], 0.0) * scene.duration},
+        finite=jnp.all(jnp.stack([jnp.all(jnp.isfinite(part)) for part in parts])),
+    )
+
+
+@cache
+def tracer(resolution: Resolution):
+    """`prepare` for a batch, compiled once."""
+    return jax.jit(jax.vmap(lambda scene: prepare(scene, resolution)))
+
+
+@cache
+def follower(how: Integration):
+    """`follow` for a batch, compiled once."""
+    return jax.jit(jax.vmap(lambda wire, table, scene: follow(wire, table, scene, how)))
+
+
+FLOATS = (
+    *("vertices", "mass", "friction", "joint", "length", "offset", "joint_inertia", "viscous", "dry", "gravity"),
+    *("rough", "until_value", "duration"),
+)
+
+
+def margin(floats: dict, scene: Scenes, how: Integration):
+    """The margin of a scene as a function of its floats and the schedule's values (in `floats["torque"]`)."""
+    scene = scene._replace(**{name: floats[name] for name in FLOATS})
+    _, table = prepare(scene, Resolution())
+    schedule = Torque(jax.lax.stop_gradient(scene.knots * scene.duration), floats["torque"])
+    seen = window(schedule, jnp.zeros_like(scene.duration), scene.duration)
+    motion = move(table, seen, scene.duration, how=how)
+    return score(table, seen, scene.duration, motion, how).margin
+
+
+@cache
+def value(how: Integration):
+    """The margins of a batch."""
+    return jax.jit(jax.vmap(lambda floats, scene: margin(floats, scene, how)))
+
+
+@cache
+def forward(how: Integration):
+    """Margins of a batch and their derivatives along given directions, in forward mode."""
+    return jax.jit(jax.vmap(lambda f, way, scene: jax.jvp(lambda f: margin(f, scene, how), (f,), (way,))))
+
+
+@cache
+def reverse(how: Integration):
+    """The gradients of a batch, in reverse mode."""
+    return jax.jit(jax.vmap(jax.grad(lambda floats, scene: margin(floats, scene, how))))

@@ -1,0 +1,367 @@
+"""The work of one process of the stability sweep: trace, simulate and check blocks of scenes, level by level."""
+
+import pickle
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import stability_checks as checks
+from stability import BLOCK, STATUSES
+from stability_model import Model, dot
+from stability_programs import GAUSS, follower, tracer
+from stability_scenes import Scenes, draw
+
+from wholearm_jax.motion import Integration
+from wholearm_jax.wire import Resolution
+
+REASONS = (
+    "",
+    "contacts do not touch",
+    "start out of place",
+    "heading names a still coordinate",
+    "rank lost",
+    "wedged by friction",
+    "end or kink not located",
+    "table too coarse",
+    "wire too long",
+)
+NONE, APART, MISPLACED, STILL, RANK, WEDGED, ASTRAY, COARSE, LONG = range(len(REASONS))
+
+
+class Level(NamedTuple):
+    """How finely wires are tabulated, steps and tolerance of a phase, and how many scenes share a program's run."""
+
+    pieces: int
+    panels: int
+    steps: int
+    tolerance: float
+    lanes: int
+
+
+class Precision(NamedTuple):
+    """Levels, the largest interpolation error of a table, and what counts as wrong."""
+
+    levels: tuple[Level, ...]
+    coarse: float
+    limits: checks.Limits
+
+
+DOUBLE = Precision(
+    (Level(6, 64, 128, 1e-10, 64), Level(48, 512, 2048, 1e-12, 8), Level(48, 512, 16384, 1e-12, 4)),
+    1e-9,
+    checks.DOUBLE,
+)
+SINGLE = Precision(
+    (Level(6, 64, 128, 1e-5, 64), Level(48, 512, 2048, 1e-5, 8)),
+    1e-3,
+    checks.SINGLE,
+)
+
+
+def work(blocks, seed, *, single, target: Path):
+    """Run blocks of scenes and write one record a scene."""
+    jax.config.update("jax_enable_x64", not single)
+    records, samples = [], []
+    for block in blocks:
+        begun = time.perf_counter()
+        scenes = draw(BLOCK, 1_000_003 * seed + block)
+        found = swept(scenes, SINGLE if single else DOUBLE)
+        records.append(found | {"block": np.full(BLOCK, block), "row": np.arange(BLOCK)})
+        counts = zip(np.bincount(found["status"], minlength=10), STATUSES, strict=True)
+        named = ", ".join(f"{n} {name}" for n, name in counts if n)
+        wrong = int((found["violations"] != 0).sum())
+        print(f"block {block}: {time.perf_counter() - begun:.0f} s; {named}; {wrong} violations", flush=True)
+    together = {key: np.concatenate([r[key] for r in records]) for key in records[0]}
+    target.write_bytes(pickle.dumps(together | {"extra": samples}))
+
+
+def swept(scenes: Scenes, precision: Precision) -> dict[str, np.ndarray]:
+    """One record a scene, from the first level at which nothing is left open."""
+    found = blank(scenes)
+    rows = np.arange(len(scenes.count))
+    for number, level in enumerate(precision.levels):
+        final = number == len(precision.levels) - 1
+        later, ready = [], []
+        for some, wires, tables in traced(scenes, rows, level):
+            full = tables.count >= level.pieces
+            coarse = (tables.status == 0) & ~(tables.error <= precision.coarse)
+            again = (full | coarse) & (not final) & (level.panels < precision.levels[-1].panels)
+            status = np.where((tables.status == 0) & (full | coarse), checks.NO_CONVERGENCE, tables.status)
+            later.append(some[again])
+            refused = ~again & (status != 0)
+            refuse(found, scenes, some, wires, tables, status, refused, precision.limits)
+            good = np.flatnonzero(~again & (status == 0))
+            ready.append((some[good], picked(wires, good), picked(tables, good)))
+        found["level"][rows] = number
+        for stepped in (False, True):
+            for some, wires, tables in regrouped(ready, scenes, stepped, level.lanes):
+                later.append(simulate(found, scenes, some, wires, tables, level, stepped, final, precision.limits))
+        rows = np.sort(np.concatenate(later))
+        if not len(rows):
+            break
+    return found
+
+
+def blank(scenes: Scenes):
+    """Records before anything is known."""
+    n = len(scenes.count)
+    whole = ("status", "table_status", "reason", "violations", "level", "steps", "wire_end", "pieces")
+    real = ("margin", "scale", "condition", "table_error", "length", "travel", "end_share", *RESIDUALS, *EXCESSES)
+    found = {name: np.zeros(n, int) for name in whole} | {name: np.full(n, np.nan) for name in real}
+    found |= {"moved": np.zeros(n, bool), "corner": np.zeros(n, bool), "slope": np.zeros(n)}
+    return found | {"family": scenes.family, "exact": scenes.exact, "at_rest": scenes.at_rest}
+
+
+RESIDUALS = ("closure", "tangent", "columns", "seam", "motion", "constraint", "energy")
+EXCESSES = ("sign", "beyond", "depth", "margin_excess", "tension_missed")
+
+
+def picked(tree, rows):
+    """Some rows of arrays with a leading axis."""
+    return jax.tree.map(lambda a: a[rows], tree)
+
+
+def batches(count, lanes):
+    """Row numbers in batches of one size; the last is filled up with repetitions, `real` says how many are not."""
+    for first in range(0, count, lanes):
+        rows = np.arange(first, min(first + lanes, count))
+        yield np.resize(rows, lanes), len(rows)
+
+
+def to_device(tree):
+    """NumPy to JAX, floats in JAX's default precision."""
+    return jax.tree.map(lambda a: jnp.asarray(a, float if a.dtype.kind == "f" else None), tree)
+
+
+def traced(scenes, rows, level):
+    """Wires and tables of some scenes, batch by batch, as NumPy."""
+    program = tracer(Resolution(level.pieces, level.panels, 8))
+    for batch, real in batches(len(rows), level.lanes):
+        some = rows[batch]
+        wires, tables = program(to_device(Scenes(*scenes[some])))
+        some = some[:real]
+        wires, tables = jax.tree.map(lambda a, real=real: np.asarray(a)[:real], (wires, tables))
+        yield some, wires, tables
+
+
+def regrouped(ready, scenes, stepped, lanes):
+    """Traced scenes with or without steps in their torque, in full batches."""
+    if not ready:
+        return
+    rows = np.concatenate([some for some, _, _ in ready])
+    wires, tables = (jax.tree.map(lambda *a: np.concatenate(a), *[part[k] for part in ready]) for k in (1, 2))
+    mine = np.flatnonzero(scenes.stepped[rows] == stepped)
+    for batch, real in batches(len(mine), lanes):
+        at = mine[batch]
+        yield (rows[at], real), picked(wires, at), picked(tables, at)
+
+
+# --- refusals --------------------------------------------------------------------------------------------------------
+
+
+def flag(found, rows, name, wrong):
+    """Note a violation."""
+    found["violations"][rows] |= np.where(wrong, 1 << checks.VIOLATIONS.index(name), 0)
+
+
+def refuse(found, scenes, some, wires, tables, status, which, limits):
+    """Record scenes without a table, and whether the status has a reason."""
+    at = np.flatnonzero(which)
+    if not len(at):
+        return
+    rows, wires, tables, status = some[at], picked(wires, at), picked(tables, at), status[at]
+    some = scenes[rows]
+    model = Model.of(some)
+    start = np.asarray(wires.start, float)
+    finite = np.isfinite(start).all(1)
+    start = np.where(finite[:, None], start, 0.0)
+    heading = np.zeros_like(start)
+    heading[np.arange(len(at)), some.coordinate] = some.sign
+    x = model.tangent(start[:, None], heading[:, None])[0][:, 0]
+    touching = np.abs(model.geometry(start[:, None]).gap[:, 0]).max(1) < 100 * limits.closure
+    still = np.abs(dot(x, heading)) < 1e-5
+    reason = np.select(
+        [
+            status == checks.LEFT,
+            status == checks.MAX_STEPS,
+            ~touching,
+            (status == checks.SINGULAR) & still,
+            (status == checks.SINGULAR) & (wires.status == 0),
+            status == checks.SINGULAR,
+            wires.status == 0,
+        ],
+        [MISPLACED, LONG, APART, STILL, WEDGED, RANK, COARSE],
+        ASTRAY,
+    )
+    out = checks.outside(model, start[:, None])[:, 0]
+    deep = model.depth(start[:, None])
+    behind = model.crossing(start[:, None])[:, 0]
+    in_place = (out < limits.closure) & (deep[0][:, 0] < limits.closure) & ~behind
+    flag(found, rows, "refused although in place", (reason == MISPLACED) & in_place)
+    flag(found, rows, "refused although touching", (reason == APART) & some.exact & (status != checks.LEFT))
+    rank = np.flatnonzero((reason == RANK) | (reason == ASTRAY))
+    lost = np.zeros(len(at), bool)
+    if len(rank):
+        lost[rank] = checks.loses_rank(model.take(rank), start[rank], x[rank])
+    wedge = np.zeros(len(at), bool)
+    some_wedged = np.flatnonzero(reason == WEDGED)
+    if len(some_wedged):
+        wedge[some_wedged] = wedged(model.take(some_wedged), picked(wires, some_wedged))
+    flag(found, rows, "singular without a reason", ((reason == RANK) & ~lost) | ((reason == WEDGED) & ~wedge))
+    found["status"][rows], found["table_status"][rows], found["reason"][rows] = status, status, reason
+    found["condition"][rows], found["table_error"][rows] = tables.condition, tables.error
+    found["pieces"][rows] = tables.count
+
+
+def wedged(model, wires):
+    """Whether friction wedges the object at a node of its wire, by the other model."""
+    nodes = np.asarray(wires.nodes, float)
+    lanes, panels, count, _ = nodes.shape
+    owner = np.repeat(wires.owner, count, axis=1)[:, :, None]
+    signs = [np.take_along_axis(np.asarray(s, float), owner, axis=1) for s in (wires.slip_sign, wires.joint_sign)]
+    toward = np.take_along_axis(np.asarray(wires.chart, float), owner, axis=1)
+    return checks.wedged(model, nodes.reshape(lanes, panels * count, 5), toward, signs[0])
+
+
+# --- motions ---------------------------------------------------------------------------------------------------------
+
+
+def simulate(found, scenes, which, wires, tables, level, stepped, final, limits):
+    """Simulate, check and record a batch; returns the rows that need more steps or a tighter tolerance."""
+    rows, real = which
+    how = Integration(
+        max_steps=level.steps, stages=max(8, level.steps // 128), tolerance=level.tolerance, steps=stepped
+    )
+    result = follower(how)(to_device(wires), to_device(tables), to_device(Scenes(*scenes[rows])))
+    wires, tables, result = jax.tree.map(lambda a: np.asarray(a)[:real], (wires, tables, result))
+    rows = rows[:real]
+    some = scenes[rows]
+    model = Model.of(some)
+    units = checks.Units.of(model)
+    found["violations"][rows] = 0
+    check_wire(found, rows, some, model, units, wires, tables, result, limits)
+    check_motion(found, rows, model, units, result, limits)
+    check_rest(found, rows, some, model, units, result, limits)
+    found["status"][rows], found["table_status"][rows] = result.status, tables.status
+    found["condition"][rows], found["table_error"][rows] = tables.condition, tables.error
+    found["length"][rows] = tables.breaks[:, -1] - tables.breaks[:, 0]
+    found["travel"][rows] = result.s
+    found["moved"][rows] = result.moved
+    found["steps"][rows], found["end_share"][rows] = result.count, result.share
+    found["wire_end"][rows], found["pieces"][rows] = wires.end_why, tables.count
+    again = (result.status == checks.MAX_STEPS) | (found["energy"][rows] > limits.energy)
+    return rows[again & (not final)]
+
+
+def check_wire(found, rows, some, model, units, wires, tables, result, limits):
+    """The whole length of a wire and its table."""
+    along = units.remove(result.along)
+    for name, value in checks.wire_residuals(model, along).items():
+        found[name][rows] = value.max(1)
+    found["seam"][rows] = result.seam
+    found["sign"][rows] = checks.wire_signs(model, along).max(1)
+    found["beyond"][rows] = checks.outside(model, along["z"]).max(1)
+    lane, place = np.nonzero(model.crossing(along["z"]))
+    depth, corner = np.zeros((2, *along["z"].shape[:2]))
+    if len(lane):
+        deep, roots = model.take(lane).depth(along["z"][lane, place][:, None])
+        depth[lane, place], corner[lane, place] = deep[:, 0], roots[:, 0]
+    found["depth"][rows] = depth.max(1)
+    found["corner"][rows] = corner.max(1) > limits.place
+    flag(found, rows, "closure", found["closure"][rows] > limits.closure)
+    flag(found, rows, "tangent", found["tangent"][rows] > limits.tables)
+    flag(found, rows, "equations of the table", found["columns"][rows] > limits.tables)
+    flag(found, rows, "seam between pieces", found["seam"][rows] > limits.tables)
+    flag(found, rows, "sign within a piece", found["sign"][rows] > limits.sign)
+    flag(found, rows, "contact beyond its feature", found["beyond"][rows] > limits.place)
+    # The model has no contact at a finger's root or the palm's end: what enters there is counted apart.
+    deep = (found["depth"][rows] > limits.place) & ~found["corner"][rows]
+    flag(found, rows, "link in the object", deep & (depth[:, 0] < limits.place))
+    found["slope"][rows] = deep & (depth[:, 0] > limits.place)
+    until = some.until_coordinate, some.until_value / units.z[np.arange(len(rows)), some.until_coordinate]
+    real = checks.end_is_real(model, along["z"][:, -1], wires.end_why, wires.end_contact, until, limits.place)
+    flag(found, rows, "end without a cause", ~real)
+    first, x = along["z"][:, 0], along["x"][:, 0]
+    away = first - some.rough / units.z
+    x = x / np.sqrt(dot(x, x))[:, None]
+    lean = np.abs(dot(away, x)) / (np.sqrt(dot(away, away)) + 1e-3)
+    flag(found, rows, "start not the nearest", lean > limits.tables * 10)
+    flag(found, rows, "start heads the wrong way", x[np.arange(len(rows)), some.coordinate] * some.sign <= 0)
+
+
+def check_motion(found, rows, model, units, result, limits):
+    """The equations of motion at times, energy from start to end, and the margin against forces within steps."""
+    at = units.remove(result.at)
+    live = ~result.at["held"] & result.moved[:, None]
+    for name, value in checks.motion_residuals(model, at).items():
+        found[name][rows] = np.where(live, value, 0.0).max(1)
+    steps = max(1, int(result.count.max()))
+    width = result.within["width"][:, :steps, None] * GAUSS[1] / 2 * ~result.within["held"][:, :steps]
+    within = {key: value[:, :steps] for key, value in result.within.items() if key != "width"}
+    within = {key: value.reshape(len(rows), -1, *value.shape[3:]) for key, value in within.items()}
+    within = units.remove(within)
+    weights = width.reshape(len(rows), -1)
+    moving = result.moved & (result.status != checks.MAX_STEPS)
+    energy = checks.energy_residual(model, units.remove(result.ends), within, weights)
+    found["energy"][rows] = np.where(moving, energy, np.nan)
+    force = np.where((weights > 0)[..., None], within["force"], np.nan)
+    scale = np.nanmax(np.abs(force), axis=(1, 2), initial=0.0)
+    slack = model.slack(force)
+    least = np.nanmin(slack, axis=(1, 2), initial=np.inf)
+    margin = result.margin / units.force
+    found["margin"][rows], found["scale"][rows] = np.where(moving, margin, np.nan), scale
+    excess = np.where(moving, margin - least, 0.0) / np.maximum(scale, 1e-300)
+    found["margin_excess"][rows] = np.maximum(excess, 0.0)
+    before = within["share"] < np.where(np.isfinite(result.lost), result.lost * (1 - 1e-9), np.inf)[:, None]
+    early = np.nanmin(np.where(before[..., None], slack, np.nan), axis=(1, 2), initial=np.inf)
+    found["tension_missed"][rows] = np.maximum(np.where(moving, -early / np.maximum(scale, 1e-300), 0.0), 0.0)
+    flag(found, rows, "number missing", ~result.finite | (moving & ~np.isfinite(result.margin)))
+    flag(found, rows, "equations of motion", found["motion"][rows] > limits.motion)
+    flag(found, rows, "constraint", found["constraint"][rows] > limits.motion)
+    flag(found, rows, "energy", moving & ~(energy < limits.energy))
+    flag(found, rows, "margin above a force", found["margin_excess"][rows] > limits.motion)
+    good = (result.status == checks.OK) | (result.moving_status == checks.OK)
+    flag(found, rows, "ok with a tensile force", good & moving & ~(result.margin >= 0))
+    flag(found, rows, "tension not seen in time", found["tension_missed"][rows] > limits.motion)
+
+
+def check_rest(found, rows, some, model, units, result, limits):
+    """How motions begin and end: what an object at rest does, and where it stands when it ends."""
+    times = some.knots
+    value = np.asarray(result.torque.values, float) / units.torque[:, None, None]
+    ends = units.remove(result.ends)
+    verdict_at = np.where(result.ended == checks.STUCK, result.rest, result.share)
+    for name, place, begin, stop, status in (
+        ("rest contradicts accelerations", 1, verdict_at, 1.0, result.ended),
+        ("departure contradicts accelerations", 0, 0.0 * result.rest, result.departs, None),
+    ):
+        rest = checks.Rest(model, ends["z"][:, place], ends["x"][:, place])
+        begin, stop = np.broadcast_to(begin, len(rows)), np.broadcast_to(stop, len(rows))
+        inside = (times > begin[:, None]) & (times < stop[:, None])
+        first, last = (torque_at(times, value, at, side) for at, side in ((begin, "right"), (stop, "left")))
+        torque = np.concatenate([first[:, None], value, last[:, None]], axis=1)
+        live = np.concatenate([np.ones((len(rows), 1), bool), inside, np.ones((len(rows), 1), bool)], axis=1)
+        if status is not None:
+            wrong = checks.resting_verdicts(rest, status, torque, live, limits.sign)
+        else:
+            wrong = checks.departures(rest, torque, live, torque_at(times, value, stop, "right"), limits.sign)
+            wrong &= result.moved & (result.ended != checks.MAX_STEPS)
+        flag(found, rows, name, wrong)
+    arrived = (result.ended == checks.LEFT) & ~(np.abs(result.s - result.length) < 1e-6 * result.length)
+    early = (result.ended == checks.OK) & ~(np.abs(result.share - 1) < 1e-6)
+    halted = np.isin(result.ended, (checks.STUCK, checks.REVERSED, checks.AMBIGUOUS)) & ~(result.w == 0)
+    flag(found, rows, "end of the motion", arrived | early | halted)
+
+
+def torque_at(times, values, at, side):
+    """The schedule at one time a scene, from the left or the right of a step."""
+    count = times.shape[1]
+    k = (times <= at[:, None] + 1e-12).sum(1) - 1 if side == "right" else (times < at[:, None] - 1e-12).sum(1) - 1
+    k = np.clip(k, 0, count - 2)
+    row = np.arange(len(at))
+    gap = times[row, k + 1] - times[row, k]
+    share = np.where(gap > 0, (at - times[row, k]) / np.where(gap > 0, gap, 1.0), 0.0)
+    return values[row, k] + (values[row, k + 1] - values[row, k]) * share[:, None]
