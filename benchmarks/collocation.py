@@ -47,7 +47,6 @@ BELLS = tuple((p, q) for p in (1, 2, 4, 8) for q in (1, 2, 4, 8))  # motions wit
 MINIMUM_JERK = (2, 2)
 MOVES, WIDELY = 12, 20  # intervals of reversals tried, and where none is to be missed
 SETTINGS = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "ipopt.max_iter": 1000, "ipopt.tol": 1e-8}
-QUICKER = {"ipopt.mu_strategy": "adaptive", "ipopt.max_iter": 300}  # mostly quicker, but once it did not end
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -143,22 +142,17 @@ def best_known(table: Table, duration: float, coarse: Collocated, *, enough: flo
     """The largest margin that collocation finds with the same knots, whatever it costs, or one of `enough` newtons.
 
     Each interval between knots is divided, into `FINE` or more in all, so that forces are held at many times and the
-    simulated margin is close to the programme's. Reversals are searched widely, from four starts that lead to different
-    optima: the minimum-jerk motion, the one that can be squeezed hardest, the coarse solution, and the best coarse
-    solution over all intervals in which a reversal may lie.
+    simulated margin is close to the programme's. Reversals are searched widely, from several starts and with both of
+    IPOPT's strategies for its barrier, since these lead to different optima.
     """
     knots = len(coarse.torque)
-    rough = Phase(read(table), duration, knots, 1)
-    phase = rough._replace(refine=-(-FINE // rough.intervals))
-    starts = [
-        lambda: _course(table, phase, MINIMUM_JERK),
-        lambda: _course(table, phase, _hardest(table, duration)),
-        lambda: coarse.course,
-        lambda: _scanned(rough, coarse.course),
-    ]
+    phase = Phase(read(table), duration, knots, -(-FINE // (knots - 1)))
+    jerk, hardest = (_course(table, phase, bell) for bell in (MINIMUM_JERK, _hardest(table, duration)))
+    starts = ((jerk, "monotone"), (jerk, "adaptive"), (coarse.course, "monotone"), (hardest, "monotone"))
     found: list[Collocated] = []
-    for start in starts:
-        found.append(_collected(table, phase, _explored(phase, start(), QUICKER)))
+    for start, strategy in starts:
+        options = {"ipopt.mu_strategy": strategy, "ipopt.max_iter": 300}
+        found.append(_collected(table, phase, _explored(phase, start, options)))
         if found[-1].succeeded and found[-1].margin >= enough:
             break
     return max(found, key=lambda one: (one.succeeded, one.margin))
@@ -471,17 +465,6 @@ def _explored(phase: Phase, course: Course, options: dict[str, Any]) -> list[Sol
         done.append(_once(phase, best.course, *waiting.pop(0), options))
         best = max(done, key=lambda one: one.rank)
     return done
-
-
-def _scanned(phase: Phase, course: Course) -> Course:
-    """The best course with each reversal in turn tried in every interval."""
-    for k in range(len(phase.wire.pieces) - 1):
-        rows, splits = _passed(phase, course)
-        tries = [(*rows[:k], row, *rows[k + 1 :]) for row in range(phase.intervals)]
-        solves = [_once(phase, course, one, splits, QUICKER) for one in tries if list(one) == sorted(one)]
-        best = max(solves, key=lambda one: one.rank)
-        course = best.course if best.course.least > course.least else course
-    return course
 
 
 def _beside(phase: Phase, solve: Solve, step: np.ndarray) -> tuple[tuple[int, ...], np.ndarray] | None:

@@ -228,7 +228,11 @@ class Rest:
             np.broadcast_to(z[:, None], some), np.broadcast_to(toward[:, None], some), torque
         )
         self.maps = [np.stack([a[:, 0], a[:, 1] - a[:, 0], a[:, 2] - a[:, 0]], axis=1) for a in answers]
-        self.healthy = np.minimum(health[0][:, 0], health[1][:, 0]) > 1e-9
+        slip = np.einsum("npci,npi->npc", model.geometry(z[:, None]).slip_rows, toward[:, None])[:, 0]
+        size = np.sqrt(dot(toward, toward))[:, None]
+        # Exactly where a slip reverses it has no sign of its own.
+        sure = np.all((np.abs(slip) > 1e-6 * size) | (model.friction == 0) | ~model.slides, axis=1)
+        self.healthy = sure & (np.minimum(health[0][:, 0], health[1][:, 0]) > 1e-9)
 
     def at(self, torque):
         """Forward and backward accelerations at torques (scenes, times, 2), each against the size of its terms."""

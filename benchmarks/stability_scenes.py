@@ -374,6 +374,7 @@ def _scaled(rng, family, shape, formation, z, exact):
     ahead = z[np.arange(n), until] + rng.uniform(-0.5, 0.5, n)
     scale = np.stack([size, size, *np.ones((3, n))], axis=1)
     knots, stepped = _knots(rng, n)
+    kind = rng.choice(4, n, p=[0.7, 0.14, 0.08, 0.08])
     return Scenes(
         vertices=shape.vertices * size[:, None, None] + shift[:, None],
         count=shape.count,
@@ -387,7 +388,7 @@ def _scaled(rng, family, shape, formation, z, exact):
         joint_inertia=joint_inertia,
         viscous=viscous,
         dry=dry,
-        torque_limit=weight * _log_uniform(rng, 0.3, 30.0, (n, 1)) * np.ones(2),
+        torque_limit=weight * _log_uniform(rng, 0.3, 100.0, (n, 1)) * np.ones(2),
         gravity=np.stack([gravity * np.sin(tilt), -gravity * np.cos(tilt)], axis=1),
         link=formation[..., 0],
         kind=formation[..., 1],
@@ -404,9 +405,9 @@ def _scaled(rng, family, shape, formation, z, exact):
         family=np.full(n, family),
         knots=knots,
         stepped=stepped,
-        torque_kind=rng.choice(4, n, p=[0.6, 0.2, 0.1, 0.1]),
+        torque_kind=kind,
         pace=_log_uniform(rng, 0.3, 3.0, n),
-        noise=_log_uniform(rng, 1e-3, 1.0, (n, 1, 1)) * rng.normal(size=(n, KNOTS, 2)),
+        noise=_noise(rng, n, kind),
     )
 
 
@@ -418,6 +419,13 @@ def _moving(rng, shape, formation, z):
     x = np.abs(model.tangent(z[:, None], np.ones(5))[0][:, 0]) + 1e-9
     rate = np.cumsum(np.where(rng.random((n, 1)) < 0.05, 1.0, np.where(x > 1e-3, x, 0.0) + 1e-12), axis=1)
     return (rng.random((n, 1)) * rate[:, -1:] > rate).sum(1)
+
+
+def _noise(rng, n, kind):
+    """Disturbances of the torque at its knots; half of the driven motions (kind 0) have hardly any."""
+    calm = (kind == 0) & (rng.random(n) < 0.5)
+    size = np.where(calm, _log_uniform(rng, 1e-6, 1e-2, n), _log_uniform(rng, 1e-2, 1.0, n))
+    return size[:, None, None] * rng.normal(size=(n, KNOTS, 2))
 
 
 def _tangential(formation):

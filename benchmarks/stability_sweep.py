@@ -264,11 +264,13 @@ def check_wire(found, rows, some, model, units, wires, tables, result, limits):
     found["seam"][rows] = result.seam
     found["sign"][rows] = checks.wire_signs(model, along).max(1)
     found["beyond"][rows] = checks.outside(model, along["z"]).max(1)
-    lane, place = np.nonzero(model.crossing(along["z"]))
-    depth, corner = np.zeros((2, *along["z"].shape[:2]))
-    if len(lane):
-        deep, roots = model.take(lane).depth(along["z"][lane, place][:, None])
-        depth[lane, place], corner[lane, place] = deep[:, 0], roots[:, 0]
+    depth, corner = depths(model, along["z"])
+    unexplained = np.flatnonzero((depth.max(1) > limits.place) & ~(corner.max(1) > limits.place))
+    if len(unexplained):
+        z = along["z"][unexplained]
+        part = np.linspace(0, 1, 16, endpoint=False)[:, None]
+        between = (z[:, :-1, None] * (1 - part) + z[:, 1:, None] * part).reshape(len(z), -1, 5)
+        corner[unexplained, 0] = depths(model.take(unexplained), between)[1].max(1)
     found["depth"][rows] = depth.max(1)
     found["corner"][rows] = corner.max(1) > limits.place
     flag(found, rows, "closure", found["closure"][rows] > limits.closure)
@@ -292,6 +294,16 @@ def check_wire(found, rows, some, model, units, wires, tables, result, limits):
     flag(found, rows, "start heads the wrong way", x[np.arange(len(rows)), some.coordinate] * some.sign <= 0)
 
 
+def depths(model, z):
+    """`Model.depth` at the places where an object's vertex lies behind a link."""
+    lane, place = np.nonzero(model.crossing(z))
+    depth, corner = np.zeros((2, *z.shape[:2]))
+    if len(lane):
+        deep, roots = model.take(lane).depth(z[lane, place][:, None])
+        depth[lane, place], corner[lane, place] = deep[:, 0], roots[:, 0]
+    return depth, corner
+
+
 def check_motion(found, rows, model, units, result, limits):
     """The equations of motion at times, energy from start to end, and the margin against forces within steps."""
     at = units.remove(result.at)
@@ -313,11 +325,13 @@ def check_motion(found, rows, model, units, result, limits):
     least = np.nanmin(slack, axis=(1, 2), initial=np.inf)
     margin = result.margin / units.force
     found["margin"][rows], found["scale"][rows] = np.where(moving, margin, np.nan), scale
-    excess = np.where(moving, margin - least, 0.0) / np.maximum(scale, 1e-300)
+    excess = np.where(moving, margin, 0.0) - np.where(moving, least, 0.0)
+    excess /= np.maximum(scale, 1e-300)
     found["margin_excess"][rows] = np.maximum(excess, 0.0)
     before = within["share"] < np.where(np.isfinite(result.lost), result.lost * (1 - 1e-9), np.inf)[:, None]
     early = np.nanmin(np.where(before[..., None], slack, np.nan), axis=(1, 2), initial=np.inf)
-    found["tension_missed"][rows] = np.maximum(np.where(moving, -early / np.maximum(scale, 1e-300), 0.0), 0.0)
+    early = np.where(moving & np.isfinite(early), early, 0.0)
+    found["tension_missed"][rows] = np.maximum(-early / np.maximum(scale, 1e-300), 0.0)
     flag(found, rows, "number missing", ~result.finite | (moving & ~np.isfinite(result.margin)))
     flag(found, rows, "equations of motion", found["motion"][rows] > limits.motion)
     flag(found, rows, "constraint", found["constraint"][rows] > limits.motion)

@@ -41,14 +41,12 @@ from tolerances import AnyTolerance, any_tolerance
 
 import wholearm_jax as wa
 from wholearm_jax import plan, scene_file
-from wholearm_jax.forces import score
 from wholearm_jax.motion import Integration, Motion, move
 from wholearm_jax.reduction import Table
 from wholearm_jax.scene import body
 from wholearm_jax.schedule import Torque, Window, padded, window
 from wholearm_jax.status import Status
 from wholearm_jax.system import system
-from wholearm_jax.verdict import judge
 
 jax.config.update("jax_enable_x64", True)
 
@@ -167,15 +165,6 @@ def _move(table: Table, seen: Window, duration, how: AnyTolerance) -> Motion:
 
 
 @eqx.filter_jit
-def _run(table: Table, schedule, start, duration, how: AnyTolerance) -> plan.Outcome:
-    """What `plan.run` does."""
-    seen = window(schedule, start, duration)
-    motion = move(table, seen, duration, how=how)
-    scored = score(table, seen, duration, motion, how)
-    return plan.Outcome(motion, scored, judge(table, motion, scored, False))
-
-
-@eqx.filter_jit
 def _at_steps(table: Table, schedule, start, duration, motion: Motion):
     """`z`, `z_dot`, `c_n` at the motion's steps."""
     there = plan.sample(table, schedule, start, duration, motion, motion.share)
@@ -201,11 +190,11 @@ def package(problem: Problem, solver: str, tolerance: float):
 
     def again():
         traced = plan.prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading)
-        return _run(traced.table, *here, how)
+        return plan.run(traced.table, *here, how, False)
 
     calls = {
         "package": lambda: _move(table, problem.seen, problem.duration, how),
-        "package, run": lambda: _run(table, *here, how),
+        "package, run": lambda: plan.run(table, *here, how, False),
         "package, trace and run": again,
     }
     return error(problem, *rows), count, calls
@@ -382,11 +371,11 @@ def _by_path(name: str, path: Path) -> ModuleType:
     return module
 
 
-def _whole_loops(quick: bool) -> dict:
-    """Times of the same in a process where XLA compiles loops whole."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} {WHOLE}".strip()
-    command = [sys.executable, __file__, "--times-only", *(["--quick"] if quick else [])]
-    done = subprocess.run(command, env=os.environ | {"XLA_FLAGS": flags}, stdout=subprocess.PIPE, check=True, text=True)
+def _in_process(*arguments: str, flags: str = "") -> dict:
+    """`everything` in a process with its own settings of XLA; small systems are solved on one thread."""
+    own = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip(), "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, __file__, *arguments]
+    done = subprocess.run(command, env=os.environ | own, stdout=subprocess.PIPE, check=True, text=True)
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -394,15 +383,13 @@ def main() -> None:
     """Measure, save, draw, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer solvers and tolerances")
-    parser.add_argument(
-        "--times-only", action="store_true", help="print times of the package and the direct way as JSON"
-    )
+    parser.add_argument("--print", choices=("all", "times"), help="measure here and print rows as JSON")
     given = parser.parse_args()
-    found = everything(given.quick, not given.times_only)
-    if given.times_only:
-        print(json.dumps(found))
+    if given.print:
+        print(json.dumps(everything(given.quick, given.print == "all")))
         return
-    whole = _whole_loops(given.quick)
+    quick = ["--quick"] if given.quick else []
+    found, whole = _in_process("--print=all", *quick), _in_process("--print=times", *quick, flags=WHOLE)
     for problem, rows in whole.items():
         for name, timed in rows.items():
             for row, known in zip(timed, found[problem][name], strict=True):

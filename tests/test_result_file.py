@@ -25,7 +25,7 @@ HEADER = (
 def pushed():
     """The heptagon pushed to the left in two phases under constant torques, each arriving with the speed it has."""
     data = to_dict(load("heptagon"))
-    slide = data["phase"][0] | {"arrive": "moving", "duration": 0.3}
+    slide = data["phase"][0] | {"arrive": "caught", "duration": 0.3}
     data["phase"] = [slide | {"name": "near", "until": {"x": 0.0}}, slide | {"name": "far"}]
     result = simulate(parse(data), torque([0.0, 0.3, 0.3, 0.6], [[0.55, -0.24]] * 2 + [[0.5, -0.1]] * 2))
     assert result.status is Status.OK, result.message

@@ -74,23 +74,24 @@ def test_joined_intervals_are_the_phase():
     at = [int(np.argmin(np.abs(shares - k / (knots - 1)))) for k in range(knots)]
     assert np.abs(shares[at] - np.arange(knots) / (knots - 1)).max() < 1e-9, "steps end on the knots"
     state = np.stack([(motion.s[np.array(at)] - table.breaks[0]), motion.w[np.array(at)]], axis=1) / float(table.length)
-    p = Variables(found.torque.values / table.torque_limit, jnp.asarray(state), jnp.zeros(()))
-    ends = jax.vmap(lambda q: shoot(table, HOW, knots - 1, q).end)(local(p))
+    p = Variables((found.torque.values / table.torque_limit)[None], jnp.asarray(state)[None], jnp.zeros(1))
+    ends = jax.vmap(lambda q: shoot(table, HOW, knots - 1, q).end)(local(p)[0])
     np.testing.assert_allclose(ends, state[1:], atol=1e-8)
 
 
 def test_a_curved_step_starts_along_its_direction_and_keeps_pinned_torques(flip):
     rng = np.random.default_rng(3)
     state = np.stack([np.linspace(0.1, 0.8, 6), np.full(6, 1.0)], axis=1)
-    p = Variables(jnp.asarray(rng.uniform(-0.5, 0.5, (6, 2))), jnp.asarray(state), jnp.zeros(()))
+    p = Variables(jnp.asarray(rng.uniform(-0.5, 0.5, (1, 6, 2))), jnp.asarray(state)[None], jnp.zeros(1))
+    tables = jax.tree.map(lambda a: a[None], flip)
     way = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), p)
-    pinned = np.zeros(6, bool)
-    pinned[0] = True
+    pinned = np.zeros((1, 6), bool)
+    pinned[0, 0] = True
     one = jnp.ones(())
-    limits = Limits(jnp.full(2, jnp.inf), one, one, jnp.asarray(pinned), one)
-    _, tangent = jax.jvp(lambda share: moved(p, way, share, flip, limits), (0.0,), (1.0,))
+    limits = Limits(jnp.full(2, jnp.inf), one, one, jnp.asarray(pinned), jnp.ones(1))
+    _, tangent = jax.jvp(lambda share: moved(p, way, share, tables, limits), (0.0,), (1.0,))
     for got, want in zip(jax.tree.leaves(tangent), jax.tree.leaves(way), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-9)
-    there = moved(p, way, 0.05, flip, limits)
-    np.testing.assert_allclose(there.torque[0], p.torque[0] + 0.05 * way.torque[0], rtol=1e-12)
-    assert float(jnp.abs(there.torque[1:] - p.torque[1:] - 0.05 * way.torque[1:]).max()) > 1e-4
+    there = moved(p, way, 0.05, tables, limits)
+    np.testing.assert_allclose(there.torque[0, 0], p.torque[0, 0] + 0.05 * way.torque[0, 0], rtol=1e-12)
+    assert float(jnp.abs(there.torque[0, 1:] - p.torque[0, 1:] - 0.05 * way.torque[0, 1:]).max()) > 1e-4
