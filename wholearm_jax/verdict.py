@@ -1,10 +1,8 @@
 """Judge: what became of a simulated phase, from its motion and its score."""
 
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.forces import Score, slack
 from wholearm_jax.motion import Motion
@@ -12,10 +10,10 @@ from wholearm_jax.reduction import Change, Table
 from wholearm_jax.status import Status
 
 ARRIVAL = 1e-6  # of the wire's length: how near its end a phase that arrives at rest must come
-ARRIVAL_SPEED = math.sqrt(12 * ARRIVAL)
-"""Speed left at arrival, in wire lengths a duration: what braking at 6 lengths a duration squared (the even
-rest-to-rest motion) ends within `ARRIVAL` of a length. Nearer to the end time and position do not fix the speed better
-than this square root."""
+BRAKING = 12.0
+"""The speed left at arrival within a share `a` of the wire is at most `sqrt(BRAKING a)` wire lengths a duration: what
+braking at 6 lengths a duration squared (the even rest-to-rest motion) ends within `a` of a length. Nearer to the end
+time and position do not fix the speed better than this square root."""
 
 PULL = 1e-9  # share of the largest impulse by which one may be negative for rounding
 
@@ -28,22 +26,30 @@ class Verdict(eqx.Module):
     contact: Int[Array, ""]
 
 
-def judge(table: Table, motion: Motion, score: Score, at_rest: bool, entered: Change) -> Verdict:
-    """Decide the status of a phase that must end at rest (`at_rest`) or may end moving.
+def judge(
+    table: Table,
+    motion: Motion,
+    score: Score,
+    at_rest: bool | Bool[Array, ""],
+    entered: Change,
+    arrival: float | Float[Array, ""] = ARRIVAL,
+) -> Verdict:
+    """Decide the status of a phase that must end at rest (`at_rest`) or may end moving, within a share `arrival` of
+    its wire's length.
 
     The earliest trouble counts: a wire that cannot be traced, an impulse that would pull (or throw the object back)
     where the phase is entered with speed, a tensile force, then how the motion ended.
     """
     share, s, w = (values[motion.count] for values in (motion.share, motion.s, motion.w))
-    near = jnp.abs(table.breaks[-1] - s) <= ARRIVAL * table.length
-    slow = w <= ARRIVAL_SPEED * table.length
-    late = share >= 1 - ARRIVAL_SPEED
+    speed = jnp.sqrt(BRAKING * jnp.asarray(arrival, s.dtype))
+    near = jnp.abs(table.breaks[-1] - s) <= arrival * table.length
+    slow = w <= speed * table.length
+    late = share >= 1 - speed
     ended = motion.status
-    if at_rest:
-        held = (ended == Status.STUCK) | ((ended == Status.REVERSED) & late) | (ended == Status.LEFT_FORMATION)
-        arrived = near & slow & (held | (ended == Status.OK))
-    else:
-        arrived = near & ((ended == Status.LEFT_FORMATION) | (ended == Status.OK))
+    held = (ended == Status.STUCK) | ((ended == Status.REVERSED) & late) | (ended == Status.LEFT_FORMATION)
+    at_ease = near & slow & (held | (ended == Status.OK))
+    passing = near & ((ended == Status.LEFT_FORMATION) | (ended == Status.OK))
+    arrived = jnp.where(at_rest, at_ease, passing)
     finish = jnp.where(arrived, int(Status.OK), jnp.where(ended == Status.OK, int(Status.NOT_REACHED), ended))
     lost = jnp.isfinite(score.lost)
     status = jnp.where(lost, int(Status.CONTACT_LOST), finish)
