@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from wholearm_jax.motion import Integration
 from wholearm_jax.plan import (
     Outcome,
+    Result,
     Traced,
     end_configuration,
     joined,
@@ -68,7 +69,7 @@ class Level(NamedTuple):
     error: float
 
 
-QUICK = Level(Resolution(6, 24, 8), Integration(tolerance=1e-8, max_steps=128, stages=6), 1e-8)
+QUICK = Level(Resolution(6, 16, 8), Integration(tolerance=1e-8, max_steps=128, stages=6), 1e-7)
 FULL = Level(Resolution(), Integration(), 1e-9)
 
 
@@ -96,7 +97,7 @@ class Given(eqx.Module):
 
     def part(self, numbers: np.ndarray) -> "Given":
         """Some of the scenes, numbered anew."""
-        return Given(jax.tree.map(lambda leaf: leaf[numbers], self.scenes))
+        return Given(jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), self.scenes))
 
 
 class _Phases(NamedTuple):
@@ -285,7 +286,11 @@ def _stop(traced: Traced, done: Outcome, formation: Formation, level: Level) -> 
 
 def _check_alone(scene: Scene, torque: Torque, arrival) -> Checked:
     """One scene by `simulate`, which refines until all is fine."""
-    result = simulate(scene, torque, arrival=float(arrival))
+    return from_result(simulate(scene, torque, arrival=float(arrival)))
+
+
+def from_result(result: Result) -> Checked:
+    """A simulated plan as one scene of a check."""
     rows = list(result.phases)
     failed = next((k for k, p in enumerate(rows) if p.status is not Status.OK), None)
     where = int(np.argmin([p.margin for p in rows])) if failed is None else failed

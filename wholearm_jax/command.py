@@ -1,4 +1,4 @@
-"""The command line: `wholearm optimise`, `simulate`, `search`, `formations`, `execute`, `scenes`.
+"""The command line: `wholearm optimise`, `simulate`, `search`, `formations`, `execute`, `check`, `scenes`.
 
 Exit status 0 when the result is `ok`, 1 when the plan fails (its status is printed), 2 for bad input, in one line.
 """
@@ -12,20 +12,20 @@ from typing import Annotated
 import jax
 import typer
 
+from wholearm_jax.arguments import BadInput, SceneName, TorqueFile
+from wholearm_jax.batch_command import check
+
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
-SceneName = Annotated[str, typer.Argument(help="A bundled scene's name, or the path of a scene file.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for torque.csv, trajectory.csv, summary.json and figures.")]
 Changes = Annotated[
     list[str] | None,
     typer.Option("--set", help="PHASE.duration=SECONDS; PHASE is a name or a number from 0. May be repeated."),
 ]
-TorqueFile = Annotated[Path, typer.Option("--torque", help="Torque schedule, CSV with the header t,tau1,tau2.")]
 Samples = Annotated[int, typer.Option(min=2, help="Rows a phase in trajectory.csv.")]
 
 
-class _BadInput(Exception):
-    """What the user gave cannot be used; the message is one line."""
+app.command()(check)
 
 
 def main() -> None:
@@ -39,7 +39,7 @@ def main() -> None:
 
     try:
         app()
-    except (SceneError, _BadInput) as error:
+    except (SceneError, BadInput) as error:
         print(f"wholearm: {error}", file=sys.stderr)
         sys.exit(2)
 
@@ -150,7 +150,7 @@ def formations(
         row = _phase_number(loaded, after)
         if row is None:
             names = ", ".join(p.name for p in loaded.phases)
-            raise _BadInput(f"--after {after}: no such phase; phases: {names}")
+            raise BadInput(f"--after {after}: no such phase; phases: {names}")
         z, z_dot = end_configuration(traced[row]), leaving(traced[row].table)
     found = ways(loaded, z, z_dot)
     table = Table(title=f"touching: {', '.join(touching(loaded, z))}")
@@ -200,7 +200,7 @@ def execute(
 ) -> None:
     """Execute a torque schedule open loop on free bodies with soft contacts, in MuJoCo."""
     if video and out is None:
-        raise _BadInput("--video: needs a folder to write to: add --out DIR")
+        raise BadInput("--video: needs a folder to write to: add --out DIR")
     shares = _share("--friction", friction), _share("--mass", mass)
     loaded = _scene(scene, None)
     try:
@@ -211,7 +211,7 @@ def execute(
     except ModuleNotFoundError as error:
         if error.name != "mujoco":
             raise
-        raise _BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
+        raise BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
     from wholearm_jax.result_file import read_torque
 
     schedule = read_torque(torque)
@@ -244,7 +244,7 @@ def _share(option: str, text: str) -> float:
     except ValueError:
         share = -1.0
     if not 0 <= share < 1:
-        raise _BadInput(f"{option} {text}: write a share between 0 and 1, e.g. 10% or 0.1")
+        raise BadInput(f"{option} {text}: write a share between 0 and 1, e.g. 10% or 0.1")
     return share
 
 
@@ -255,7 +255,7 @@ def _predicted(scene, schedule, torque: Path, tolerance: float, traced):
     try:
         return follow(scene, schedule, tolerance=tolerance, traced=traced)
     except ValueError as error:
-        raise _BadInput(f"{torque}: {error}") from None
+        raise BadInput(f"{torque}: {error}") from None
 
 
 def _scene(name: str, changes: list[str] | None):
@@ -299,8 +299,8 @@ def _traced(name: str, scene):
             which = phase.formation.names[phase.formation.contact_of_slot[worst]]
             key, size = f"phase[{k}].contacts", float(gap[worst] * length)
             if phase.formation.tangential[worst]:
-                raise _BadInput(f"{name}: {key}: {which} cannot stay in its place {where}: it is off by {size:.3g} m")
-            raise _BadInput(f"{name}: {key}: {which} cannot touch {where}: a gap of {size:.3g} m stays open")
+                raise BadInput(f"{name}: {key}: {which} cannot stay in its place {where}: it is off by {size:.3g} m")
+            raise BadInput(f"{name}: {key}: {which} cannot touch {where}: a gap of {size:.3g} m stays open")
         if at.table.status != 0:
             break  # what follows a wire that cannot be followed has no start
     return traced
@@ -316,13 +316,13 @@ def _changed(scene, change: str):
     names = [p.name for p in scene.phases]
     row = _phase_number(scene, phase)
     if field != "duration" or row is None:
-        raise _BadInput(f"--set {change}: write PHASE.duration=SECONDS; phases: {', '.join(names)}")
+        raise BadInput(f"--set {change}: write PHASE.duration=SECONDS; phases: {', '.join(names)}")
     try:
         seconds = float(value)
     except ValueError:
         seconds = float("nan")
     if not 0 < seconds < float("inf"):
-        raise _BadInput(f"--set {change}: a duration is a positive number of seconds")
+        raise BadInput(f"--set {change}: a duration is a positive number of seconds")
     phases = tuple(replace_duration(p, seconds) if k == row else p for k, p in enumerate(scene.phases))
     return eqx.tree_at(lambda s: s.phases, scene, phases)
 
@@ -344,7 +344,7 @@ def _folder(out: Path | None) -> Path | None:
         probe.write_text("")
         probe.unlink()
     except OSError as error:
-        raise _BadInput(f"--out {out}: cannot be written: {error.strerror}") from None
+        raise BadInput(f"--out {out}: cannot be written: {error.strerror}") from None
     return out
 
 
@@ -359,7 +359,7 @@ def _finish(result, folder: Path | None, samples: int, **more) -> None:
             write_summary(summary(result, **more), folder / "summary.json")
             _draw(result, folder)
         except OSError as error:
-            raise _BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
+            raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
     print(result.message if not folder else f"{result.message} -> {folder}")
     sys.exit(0 if result.status.value == 0 else 1)
 
@@ -375,7 +375,7 @@ def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> Non
         write_whole(folder / "model.xml", done.model_xml)
         _draw_execution(done, folder, video)
     except OSError as error:
-        raise _BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
+        raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
 
 
 def _draw_execution(done, folder: Path, video: bool) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
@@ -13,6 +14,7 @@ from matplotlib.patches import Polygon as Patch
 
 from wholearm_jax.plan import Result, trajectory
 from wholearm_jax.scene import Scene, body, parse_contact
+from wholearm_jax.survey import Survey
 
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
     from wholearm_jax.execution import Execution
@@ -298,3 +300,26 @@ def _finish(ax: Axes, result: Result) -> None:
     ax.set_xlabel("time [s]")
     ax.spines[["top", "right"]].set_visible(False)
     ax.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+
+def draw_survey(told: Survey, parameters: Sequence[tuple[str, np.ndarray]] = ()) -> Figure:
+    """A histogram of the sampled margins and, over the two `parameters` (name, shares of their amounts), a map."""
+    finite = np.isfinite(told.margins)
+    margins = told.margins[finite]
+    figure, axes = plt.subplots(1, 1 + (len(parameters) == 2), figsize=(7.2, 2.9), layout="constrained", squeeze=False)
+    left = axes[0, 0]
+    left.hist(margins, bins=60, color=COLOURS[0])
+    left.axvline(0.0, color=_INK, lw=0.8)
+    low, high = (100 * end for end in told.interval)
+    left.set(xlabel="margin [N]", ylabel="scenes", title=f"{low:.1f} to {high:.1f} % hold")
+    if len(parameters) == 2:
+        (across, x), (up, y) = parameters
+        right = axes[0, 1]
+        edges = np.linspace(-1.0, 1.0, int(np.clip(np.sqrt(len(margins) / 8), 2, 40)) + 1)
+        number, *_ = np.histogram2d(y[finite], x[finite], bins=(edges, edges))
+        total, *_ = np.histogram2d(y[finite], x[finite], bins=(edges, edges), weights=margins)
+        mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+        image = right.pcolormesh(edges, edges, mean, cmap="viridis")
+        right.set(xlabel=f"{across} (share of its amount)", ylabel=up)
+        figure.colorbar(image, ax=right, label="mean margin [N]")
+    return figure
