@@ -203,7 +203,8 @@ def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):
     for block in filled.reshape(-1, size):
         few = source if isinstance(source, Ensemble) else source.part(block)
         numbers = block if isinstance(source, Ensemble) else np.arange(size)
-        answers.append(_check_block(few, jnp.asarray(numbers), schedule, arrival, level, mesh))
+        # Several blocks in flight would wait for one another's threads for ever.
+        answers.append(jax.block_until_ready(_check_block(few, jnp.asarray(numbers), schedule, arrival, level, mesh)))
     columns = jax.tree.map(lambda *parts: np.concatenate([np.asarray(p) for p in parts])[: len(rows)], *answers)
     return columns
 
