@@ -24,7 +24,7 @@ ORDER = (
         "forces",
     ),
     *("verdict", "plan", "squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
-    *("variation", "batch", "proportion", "survey"),
+    *("variation", "batch", "robust", "proportion", "survey"),
     *("free_bodies", "execution", "perturbation"),
     *("writing", "scene_file", "result_file", "store", "polygon_file", "drawing", "__init__"),
     *("arguments", "batch_command", "command"),

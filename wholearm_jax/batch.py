@@ -1,7 +1,7 @@
 """Check: one torque schedule against very many scenes, each traced, reduced, simulated, scored and judged.
 
-The plan of one scene is a scan over its phases; `jax.vmap` makes it a block of scenes, `shard_map` one block for each
-device, with loops of its own. A chunk is a number of blocks. The first pass is coarse (`QUICK`): few panels, fewer
+The plan of one scene is a scan over its phases; `jax.vmap` makes it a block of scenes, and where there are several
+devices `shard_map` gives each its own block, with loops of its own. A chunk is a number of blocks. The first pass is coarse (`QUICK`): few panels, fewer
 steps. It knows its error; scenes for which that is too large, or which ran out of steps, are packed together and done
 again at full resolution (`FULL`), and what is left then alone, by `plan.simulate`. So neither the slowest scene nor one
 that cannot be followed holds up the others or touches their results.
@@ -203,8 +203,7 @@ def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):
     for block in filled.reshape(-1, size):
         few = source if isinstance(source, Ensemble) else source.part(block)
         numbers = block if isinstance(source, Ensemble) else np.arange(size)
-        # Several blocks in flight would wait for one another's threads for ever.
-        answers.append(jax.block_until_ready(_check_block(few, jnp.asarray(numbers), schedule, arrival, level, mesh)))
+        answers.append(_check_block(few, jnp.asarray(numbers), schedule, arrival, level, mesh))
     columns = jax.tree.map(lambda *parts: np.concatenate([np.asarray(p) for p in parts])[: len(rows)], *answers)
     return columns
 
@@ -218,6 +217,8 @@ def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Leve
         from_here = eqx.combine(arrays, static)
         return jax.vmap(lambda n: check_scene(from_here.draw(n), schedule, arrival, level))(numbers)
 
+    if mesh.size == 1:
+        return local(arrays, numbers, schedule, arrival)
     each, whole = PartitionSpec("scenes"), PartitionSpec()
     mapped = jax.shard_map(local, mesh=mesh, in_specs=(whole, each, whole, whole), out_specs=each, check_vma=False)
     return mapped(arrays, numbers, schedule, arrival)

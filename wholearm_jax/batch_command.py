@@ -1,7 +1,9 @@
-"""`wholearm check`: one schedule against very many scenes, in a store that can be gone on with.
+"""`wholearm check`: one schedule against very many scenes, in a store that can be gone on with; and
+`wholearm optimise --robust`.
 
 Every process of a run (`--coordinator`, or SLURM's variables) takes each `--processes`-th chunk; the first one makes
-the store and tells what became of all. Within a process every processor is a device of its own.
+the store and tells what became of all. A processor
+each is put to use by as many processes.
 """
 
 import os
@@ -42,7 +44,6 @@ def check(
     """Check a schedule against many variants of a scene; the same command goes on with a store it left unfinished."""
     if (polygons is None) == (count is None) or (polygons is not None and vary):
         raise BadInput("check: give either --count, with --vary QUANTITY=AMOUNT, or --polygons FILE.npz")
-    one_device_a_processor()
     place = _join(coordinator, processes, process)
     try:
         import zarr  # noqa: F401
@@ -114,12 +115,21 @@ class _Job:
         return self.knots * len(scene.phases) if self.optimise else 0
 
 
-def one_device_a_processor() -> None:
-    """Have JAX see every processor as a device, unless it has been told otherwise. Only before JAX is first used."""
-    flag, told = "--xla_force_host_platform_device_count", os.environ.get("XLA_FLAGS", "")
-    if flag not in told:
-        processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        os.environ["XLA_FLAGS"] = f"{told} {flag}={processors}".strip()
+def optimise_robustly(varied, folder: Path | None, samples: int, knots: int, steps: int, arrival: float) -> None:
+    """`wholearm optimise --robust`: write torque.csv, say how it does on seen and unseen scenes, and exit."""
+    from wholearm_jax.result_file import write_torque
+    from wholearm_jax.robust import optimise_robustly as find
+
+    found = find(varied, samples=samples, knots=knots, steps=steps, arrival=arrival)
+    for name, (nominal, robust) in (("sampled", found.seen), ("unseen", found.unseen)):
+        told = (f"{100 * h.share:.1f} % hold, worst margin {h.margin:.4g} N" for h in (nominal, robust))
+        print(f"{samples} {name} scenes: nominal {next(told)}; robust {next(told)}")
+    if folder is not None:
+        try:
+            write_torque(found.torque, folder / "torque.csv")
+        except OSError as error:
+            raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
+    sys.exit(0 if found.unseen[1].share == 1.0 else 1)
 
 
 def ensemble(scene, amounts: list[str] | None, seed: int):

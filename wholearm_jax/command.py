@@ -13,7 +13,7 @@ import jax
 import typer
 
 from wholearm_jax.arguments import BadInput, SceneName, TorqueFile
-from wholearm_jax.batch_command import check
+from wholearm_jax.batch_command import ARRIVAL, check, ensemble, optimise_robustly
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -71,11 +71,23 @@ def optimise(
     knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase.")] = 51,
     steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 120,
     rate_limit: Annotated[float | None, typer.Option(min=0.0, help="Largest torque rate [N m/s].")] = None,
-    samples: Samples = 201,
+    samples: Annotated[
+        int | None, typer.Option(min=2, help="Rows a phase in trajectory.csv (201), or samples.")
+    ] = None,
+    robust: Annotated[
+        list[str] | None, typer.Option(help="QUANTITY=AMOUNT: the best torques for --samples (64) varied scenes.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the varied scenes.")] = 0,
+    arrival: Annotated[float, typer.Option(min=1e-9, max=1.0, help="As of `check`, for --robust.")] = ARRIVAL,
 ) -> None:
     """Find the torques with the largest compressive margin, and check them by simulation."""
     loaded = _scene(scene, set_)
     folder = _folder(out)
+    if robust:
+        if rate_limit is not None:
+            raise BadInput("--robust: knows no --rate-limit")
+        optimise_robustly(ensemble(loaded, robust, seed), folder, samples or 64, knots, steps, arrival)
+    samples = samples or 201
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
