@@ -1,10 +1,10 @@
 """Check: one torque schedule against very many scenes, each traced, reduced, simulated, scored and judged.
 
 The plan of one scene is a scan over its phases; `jax.vmap` makes it a block of scenes, and where there are several
-devices `shard_map` gives each its own block, with loops of its own. A chunk is a number of blocks. The first pass is coarse (`QUICK`): few panels, fewer
-steps. It knows its error; scenes for which that is too large, or which ran out of steps, are packed together and done
-again at full resolution (`FULL`), and what is left then alone, by `plan.simulate`. So neither the slowest scene nor one
-that cannot be followed holds up the others or touches their results.
+devices `shard_map` gives each its own block, with loops of its own. A chunk is a number of blocks. The first pass is
+coarse (`QUICK`): few panels, fewer steps. It knows its error; scenes for which that is too large, or which ran out of
+steps, are packed together and done again at full resolution (`FULL`), and what is left then alone, by `plan.simulate`.
+So neither the slowest scene nor one that cannot be followed holds up the others or touches their results.
 """
 
 from collections.abc import Iterator, Sequence

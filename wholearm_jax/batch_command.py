@@ -2,8 +2,7 @@
 `wholearm optimise --robust`.
 
 Every process of a run (`--coordinator`, or SLURM's variables) takes each `--processes`-th chunk; the first one makes
-the store and tells what became of all. A processor
-each is put to use by as many processes.
+the store and tells what became of all. Several processors are put to use by as many processes.
 """
 
 import os
