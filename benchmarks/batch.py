@@ -21,7 +21,6 @@ import wholearm_jax as wa
 from wholearm_jax.batch import BLOCK
 
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_cpu_enable_async_dispatch", False)  # see `batch_command`
 
 HERE = Path(__file__).parent
 COUNTS = (128, 1024, 10_240, 102_400)

@@ -43,10 +43,6 @@ def check(
     """Check a schedule against many variants of a scene; the same command goes on with a store it left unfinished."""
     if (polygons is None) == (count is None) or (polygons is not None and vary):
         raise BadInput("check: give either --count, with --vary QUANTITY=AMOUNT, or --polygons FILE.npz")
-    import jax
-
-    # Large batches were seen to wait for ever when the processor is dispatched to asynchronously (jaxlib 0.10).
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
     place = _join(coordinator, processes, process)
     try:
         import zarr  # noqa: F401
