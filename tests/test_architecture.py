@@ -15,7 +15,6 @@ ORDER = (
         "scene",
         "contacts",
         "system",
-        "elimination",
         "newton",
         "wire",
         "reduction",
