@@ -10,18 +10,7 @@ from wholearm_jax import plan
 
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
-    *(
-        "status",
-        "scene",
-        "contacts",
-        "system",
-        "newton",
-        "wire",
-        "reduction",
-        "schedule",
-        "motion",
-        "forces",
-    ),
+    *("status", "scene", "contacts", "system", "newton", "wire", "reduction", "schedule", "motion", "forces"),
     *("verdict", "plan", "squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),
     *("free_bodies", "execution", "perturbation"),

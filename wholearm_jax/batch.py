@@ -9,7 +9,7 @@ So neither the slowest scene nor one that cannot be followed holds up the others
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
 import jax
@@ -53,12 +53,12 @@ class Checked(NamedTuple):
     motion of the failed or last phase ended, NaN where that phase has no wire.
     """
 
-    status: Int[Array, "*scenes"]
-    margin: Float[Array, "*scenes"]
-    time: Float[Array, "*scenes"]
-    contact: Int[Array, "*scenes"]
-    phase: Int[Array, "*scenes"]
-    end: Float[Array, "*scenes 5"]
+    status: Int[Array | np.ndarray, "*scenes"]
+    margin: Float[Array | np.ndarray, "*scenes"]
+    time: Float[Array | np.ndarray, "*scenes"]
+    contact: Int[Array | np.ndarray, "*scenes"]
+    phase: Int[Array | np.ndarray, "*scenes"]
+    end: Float[Array | np.ndarray, "*scenes 5"]
 
 
 class Level(NamedTuple):
@@ -131,7 +131,7 @@ def check(
     tolerance: float = 1e-6,
     arrival: float = ARRIVAL,
     chunk: int = CHUNK,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
 ) -> Checked:
     """Check a torque schedule against many scenes: the first `count` of an ensemble, or all that are given.
 
@@ -158,7 +158,7 @@ def check_chunks(
     tolerance: float = 1e-6,
     arrival: float = ARRIVAL,
     chunk: int = CHUNK,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
     wanted: Sequence[int] | None = None,
 ) -> Iterator[tuple[int, Checked]]:
     """`check` one chunk after the other: numbers of chunks (those `wanted`, by default all) with their results."""
