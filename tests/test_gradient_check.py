@@ -3,17 +3,21 @@
 import math
 
 import equinox as eqx
-import jax.numpy as jnp
 import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.gradient_check import Slope, check_gradient
 
 
-def test_all_inputs_of_a_bundled_phase():
+@pytest.fixture(scope="module")
+def slide():
     scene = wa.load("heptagon")
     scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
-    even = wa.quasistatic(scene)
+    return scene, wa.quasistatic(scene)
+
+
+def test_all_inputs_of_a_bundled_phase(slide):
+    scene, even = slide
     torque = wa.Torque(1.01 * even.times, 0.99 * even.values)
     slopes = check_gradient(scene, torque, tolerances=(1e-10,))
     assert [s.group for s in slopes] == ["torques", "object", "hand", "gravity", "start"]
@@ -39,8 +43,7 @@ def test_findings(forward, reverse, differences, uncertainty, finding):
     assert Slope("torques", 1e-10, forward, reverse, differences, uncertainty).finding == finding
 
 
-def test_a_plan_without_a_margin_has_no_slopes():
-    scene = wa.load("heptagon")
-    apart = eqx.tree_at(lambda s: s.start, scene, scene.start + jnp.array([0.0, 0.3, 0.0, 0.0, 0.0]))
+def test_a_plan_without_a_margin_has_no_slopes(slide):
+    scene, even = slide
     with pytest.raises(ValueError, match="no margin"):
-        check_gradient(apart, wa.quasistatic(scene))
+        check_gradient(scene, wa.Torque(even.times, 0 * even.values))
