@@ -10,8 +10,9 @@ from wholearm_jax import plan
 
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
-    *("status", "scene", "contacts", "system", "newton", "wire", "reduction", "schedule", "motion", "forces"),
-    *("verdict", "plan", "squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
+    *("status", "scene", "contacts", "system", "elimination", "newton", "wire", "reduction"),
+    *("schedule", "motion", "forces", "verdict", "plan", "gradient_check"),
+    *("squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),
     *("free_bodies", "execution", "perturbation"),
     *("writing", "scene_file", "result_file", "store", "polygon_file", "drawing", "__init__"),

@@ -21,6 +21,7 @@ from wholearm_jax.scene import COORDINATES, Heading, Phase, Scene, body, contact
 from wholearm_jax.squeeze import Bound, bound, hold
 from wholearm_jax.status import Status
 from wholearm_jax.system import system
+from wholearm_jax.verdict import PULL
 
 TOUCHING = 1e-7  # gap, in the object's radius, below which a contact touches
 SHORTEST = 1e-3  # wire length, in the object's radius, below which a way leads nowhere
@@ -137,7 +138,7 @@ def _way(scene, z, z_dot, names, chosen, toward: str) -> Way | None:
     """Trace one way; None where it leads nowhere."""
     coordinate, sign = COORDINATES.index(toward[:-1]), 1.0 if toward[-1] == "+" else -1.0
     nowhere = Heading(jnp.asarray(coordinate), jnp.asarray(sign), jnp.asarray(-1), jnp.asarray(0.0))
-    traced = prepare(_body(scene.object), scene.hand, scene.gravity, chosen, z, nowhere)
+    traced = prepare(body(scene.object), scene.hand, scene.gravity, chosen, z, nowhere)
     table = traced.table
     status, length = Status(int(table.status)), float(table.length)
     if status is Status.OK and length < SHORTEST:
@@ -157,12 +158,9 @@ def _way(scene, z, z_dot, names, chosen, toward: str) -> Way | None:
         static=static,
         bound=top,
         speed=float(entered.speed),
-        pulls=bool(impulse.min() < -1e-9 * np.abs(impulse).max()),
+        pulls=bool(impulse.min() < -PULL * float(entered.size)),
         traced=traced,
     )
-
-
-_body = jax.jit(body)
 
 
 @jax.jit

@@ -15,7 +15,7 @@ BRAKING = 12.0
 braking at 6 lengths a duration squared (the even rest-to-rest motion) ends within `a` of a length. Nearer to the end
 time and position do not fix the speed better than this square root."""
 
-PULL = 1e-9  # share of the largest impulse by which one may be negative for rounding
+PULL = 1e-9  # share of `Change.size` by which an impulse may be negative for rounding
 
 
 class Verdict(eqx.Module):
@@ -30,7 +30,7 @@ def judge(
     table: Table,
     motion: Motion,
     score: Score,
-    at_rest: bool | Bool[Array, ""],
+    at_rest: Bool[Array, ""],
     entered: Change,
     arrival: float | Float[Array, ""] = ARRIVAL,
 ) -> Verdict:
@@ -46,16 +46,15 @@ def judge(
     slow = w <= speed * table.length
     late = share >= 1 - speed
     ended = motion.status
-    held = (ended == Status.STUCK) | ((ended == Status.REVERSED) & late) | (ended == Status.LEFT_FORMATION)
-    at_ease = near & slow & (held | (ended == Status.OK))
-    passing = near & ((ended == Status.LEFT_FORMATION) | (ended == Status.OK))
-    arrived = jnp.where(at_rest, at_ease, passing)
+    there = (ended == Status.LEFT_FORMATION) | (ended == Status.OK)
+    held = (ended == Status.STUCK) | ((ended == Status.REVERSED) & late)
+    arrived = near & jnp.where(at_rest, slow & (there | held), there)
     finish = jnp.where(arrived, int(Status.OK), jnp.where(ended == Status.OK, int(Status.NOT_REACHED), ended))
     lost = jnp.isfinite(score.lost)
     status = jnp.where(lost, int(Status.CONTACT_LOST), finish)
     traced = table.status == 0
     room = slack(table, entered.impulse)  # impulses have the cones of forces
-    pulls = room.min() < -PULL * jnp.abs(entered.impulse).max()
+    pulls = room.min() < -PULL * entered.size
     back = entered.speed < 0
     refused = pulls | back
     early = jnp.where(pulls, int(Status.CONTACT_LOST), int(Status.REVERSED))
