@@ -42,7 +42,9 @@ def test_each_scene_is_what_simulate_says_of_it_alone(ensemble, schedule, checke
     for number in range(3):
         alone = from_result(wa.simulate(ensemble.draw(number), schedule, arrival=ARRIVAL))
         for name, value in alone._asdict().items():
-            assert getattr(checked, name)[number] == pytest.approx(value, abs=1e-9, rel=1e-9), name
+            # The place of a least force, unlike the force, is known to the square root of rounding.
+            near = 1e-6 if name == "time" else 1e-9
+            np.testing.assert_allclose(getattr(checked, name)[number], value, atol=near, rtol=near, err_msg=name)
 
 
 def test_a_scene_that_cannot_be_followed_disturbs_no_other(ensemble, schedule, checked):
