@@ -54,14 +54,14 @@ class Survey:
     def as_dict(self) -> dict:
         """The survey for a JSON file."""
         keys = ("phase", "status", "contact", "count")
-        failures = [dict(zip(keys, (*key, many), strict=True)) for key, many in self.failures.items()]
+        often = sorted(self.failures.items(), key=lambda item: -item[1])
         return {
             "count": self.count,
             "holds": self.holds,
             "share": self.holds / self.count,
             "interval": list(self.interval),
             "quantiles": {q: m if np.isfinite(m) else None for q, m in self.quantiles.items()},
-            "failures": sorted(failures, key=lambda row: -row["count"]),
+            "failures": [dict(zip(keys, (*key, many), strict=True)) for key, many in often],
         }
 
 
