@@ -13,7 +13,7 @@ ORDER = (
     *("status", "scene", "contacts", "system", "newton", "wire", "reduction", "schedule", "motion", "forces"),
     *("verdict", "plan", "squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
     *("free_bodies", "execution", "perturbation"),
-    *("writing", "scene_file", "result_file", "drawing", "__init__", "command"),
+    *("writing", "scene_file", "result_file", "palette", "report", "drawing", "__init__", "command"),
 )
 
 

@@ -1,4 +1,4 @@
-"""The command line: `wholearm optimise`, `simulate`, `search`, `formations`, `execute`, `scenes`.
+"""The command line: `wholearm optimise`, `simulate`, `search`, `report`, `formations`, `execute`, `scenes`.
 
 Exit status 0 when the result is `ok`, 1 when the plan fails (its status is printed), 2 for bad input, in one line.
 """
@@ -72,8 +72,11 @@ def optimise(
     steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 120,
     rate_limit: Annotated[float | None, typer.Option(min=0.0, help="Largest torque rate [N m/s].")] = None,
     samples: Samples = 201,
+    report: Annotated[bool, typer.Option("--report", help="Also report.html, one page with an animation.")] = False,
 ) -> None:
     """Find the torques with the largest compressive margin, and check them by simulation."""
+    if report and out is None:
+        raise _BadInput("--report: needs a folder to write to: add --out DIR")
     loaded = _scene(scene, set_)
     folder = _folder(out)
     from rich.console import Console
@@ -101,7 +104,8 @@ def optimise(
         print(f"{phase.message}; bound {float(top.value):.4g} N{reached}; stopped: {why}")
     more = {"command": "optimise", "knots": knots, "steps": len(found.history), "seconds": seconds}
     more |= {"rate_limit": rate_limit, "stopped": list(found.stopped)}
-    _finish(found.result, folder, samples, bounds=tuple(float(b.value) for b in found.bounds), **more)
+    tops = tuple(float(b.value) for b in found.bounds)
+    _finish(found.result, folder, samples, report=report, bounds=tops, **more)
 
 
 @app.command()
@@ -180,6 +184,20 @@ def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
         print(phase.message)
     print(f"{found.simulations} simulations in {found.seconds:.2f} s")
     _finish(found.result, folder, samples, command="search", simulations=found.simulations, seconds=found.seconds)
+
+
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A folder that optimise, simulate or search wrote.")],
+    out: Annotated[Path | None, typer.Option(help="The page to write; report.html in the folder unless given.")] = None,
+) -> None:
+    """Write a result folder's report: one page with an animation, plots and tables, for any browser, offline."""
+    path = out or folder / "report.html"
+    try:
+        _write_report(folder, path)
+    except OSError as error:
+        raise _BadInput(f"{path}: cannot be written: {error.strerror}") from None
+    print(path)
 
 
 @app.command()
@@ -348,7 +366,7 @@ def _folder(out: Path | None) -> Path | None:
     return out
 
 
-def _finish(result, folder: Path | None, samples: int, **more) -> None:
+def _finish(result, folder: Path | None, samples: int, report: bool = False, **more) -> None:
     """Write the files, say what became of the plan, and exit with its status."""
     if folder is not None:
         from wholearm_jax.result_file import summary, write_summary, write_torque, write_trajectory
@@ -358,10 +376,19 @@ def _finish(result, folder: Path | None, samples: int, **more) -> None:
             write_trajectory(result, folder / "trajectory.csv", samples)
             write_summary(summary(result, **more), folder / "summary.json")
             _draw(result, folder)
+            if report:
+                _write_report(folder, folder / "report.html")
         except OSError as error:
             raise _BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
     print(result.message if not folder else f"{result.message} -> {folder}")
     sys.exit(0 if result.status.value == 0 else 1)
+
+
+def _write_report(folder: Path, path: Path) -> None:
+    from wholearm_jax.report import report as page
+    from wholearm_jax.writing import write_whole
+
+    write_whole(path, page(folder))
 
 
 def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> None:
