@@ -7,6 +7,7 @@ Only the places and normals of the contacts, along which forces are drawn, are c
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import math
 from pathlib import Path
@@ -32,6 +33,7 @@ from wholearm_jax.scene_file import SceneError, parse
 from wholearm_jax.schedule import Torque
 from wholearm_jax.status import Status
 
+DASH = "\N{EN DASH}"  # for what is undefined
 _NEEDED = ("status", "margin", "message", "phases", "scene")
 _PHASE_NEEDED = ("name", "contacts", "status", "duration", "margin", "margin_time", "margin_contact", "bound")
 
@@ -117,18 +119,25 @@ def _drawn(written: Written) -> dict[str, Any]:
             }
         )
     shown = {name: _rounded(np.asarray(getattr(hand, name))) for name in ("joint", "length", "offset", "torque_limit")}
-    torque = {"t": _rounded(written.torque.times), "tau": _rounded(written.torque.values)}
     vertices = _rounded(np.asarray(solid.vertices)[: int(solid.count)])
     worst = _worst(written.summary["phases"])
     return {
         "hand": shown,
         "vertices": vertices,
         "phases": phases,
-        "torque": torque,
+        "torque": _until(written.torque, end),
         "end": end,
         "margin": worst and {key: worst[key] for key in ("margin", "margin_time", "margin_contact")},
         "dashes": DASHES,
     }
+
+
+def _until(torque: Torque, end: float) -> dict[str, Any]:
+    """The schedule's rows up to a time, and the torques then."""
+    times, values = np.asarray(torque.times), np.asarray(torque.values)
+    before = times <= end
+    last = [np.interp(end, times, column) for column in values.T]
+    return {"t": _rounded([*times[before], end]), "tau": _rounded([*values[before], last])}
 
 
 def _places(scene: Scene, formation, z: np.ndarray) -> np.ndarray:
@@ -148,7 +157,7 @@ def _columns(table: np.ndarray) -> dict[str, np.ndarray]:
     """A phase's rows `t, z, z_dot, tau, c_n, c_t` as blocks."""
     many = len(COORDINATES)
     edges = np.cumsum([0, 1, many, many, 2, 4, 4])
-    t, z, _, tau, cn, ct = (table[:, a:b] for a, b in zip(edges[:-1], edges[1:], strict=True))
+    t, z, _, tau, cn, ct = (table[:, a:b] for a, b in itertools.pairwise(edges))
     return {"t": t[:, 0], "z": z, "tau": tau, "cn": cn, "ct": ct}
 
 
@@ -206,14 +215,14 @@ def _worst(rows) -> dict[str, Any] | None:
 def _reached(row) -> str:
     """The share of its bound that a phase reached, in words."""
     top, margin = row["bound"], row["margin"]
-    return f"{100 * margin / top:.1f} %" if top and margin is not None and 0 < margin and top > 0 else "–"
+    return f"{100 * margin / top:.1f} %" if top and margin is not None and margin > 0 and top > 0 else DASH
 
 
-def _settings(summary) -> dict[str, str]:
+def _settings(summary: dict[str, Any]) -> dict[str, str]:
     """How the result was made: all that the summary says beside the result itself."""
     known = {"status", "margin", "message", "phases", "scene", "stopped"}
     named = {"seconds": "time taken [s]", "rate_limit": "largest torque rate [N m/s]", "steps": "steps of descent"}
-    return {named.get(k, k): _digits(v) for k, v in summary.items() if k not in known and v is not None}
+    return {named[k] if k in named else k: _digits(v) for k, v in summary.items() if k not in known and v is not None}
 
 
 def _colours() -> dict[str, dict[str, str]]:
@@ -232,7 +241,7 @@ def _colours() -> dict[str, dict[str, str]]:
 def _digits(value, count: int = 4) -> str:
     """A number with so many digits; what is undefined is a dash."""
     if value is None:
-        return "–"
+        return DASH
     return f"{value:.{count}g}" if isinstance(value, float) else str(value)
 
 

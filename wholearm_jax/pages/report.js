@@ -33,9 +33,9 @@ function momentAt(time) {
 
 // --- the hand and the object ---------------------------------------------------------------------------------------
 
-const forceLargest = Math.max(1e-9, ...data.phases.flatMap((p) => p.cn.flat()).filter((v) => v !== null));
+const forceLargest = Math.max(0, ...data.phases.flatMap((p) => p.cn.flat()));
 const reach = Math.max(...data.hand.length);
-const metresPerNewton = 0.45 * reach / forceLargest;
+const metresPerNewton = forceLargest > 0 ? 0.45 * reach / forceLargest : 0;
 
 function outline(z) {
   const c = Math.cos(z[2]), s = Math.sin(z[2]);
@@ -158,13 +158,13 @@ function plot(svg, curves, levels, dot) {
   for (const curve of curves) {
     let d = "", pen = "M";
     curve.t.forEach((t, k) => {
-      if (curve.v[k] === null || t > data.end + 1e-9) { pen = "M"; return; }
+      if (curve.v[k] === null) { pen = "M"; return; }
       d += `${pen} ${x(t).toFixed(2)} ${y(curve.v[k]).toFixed(2)} `;
       pen = "L";
     });
     shape("path", { d, fill: "none", stroke: curve.colour, "stroke-width": curve.width, "stroke-dasharray": curve.dash, "stroke-linejoin": "round" }, svg);
   }
-  if (dot) shape("circle", { cx: x(dot.t), cy: y(dot.v), r: 4, fill: "var(--ink)", stroke: "var(--paper)" }, svg);
+  if (dot && dot.t <= data.end) shape("circle", { cx: x(dot.t), cy: y(dot.v), r: 4, fill: "var(--ink)", stroke: "var(--paper)" }, svg);
   const line = shape("path", { class: "now", stroke: "var(--accent)", "stroke-width": 1.5 }, svg);
   svg.timeAt = (clientX) => {
     const box = svg.getBoundingClientRect();
@@ -277,7 +277,9 @@ function start() {
     svg.addEventListener("pointermove", scrub);
   }
   const newton = 10 ** Math.floor(Math.log10(forceLargest));
-  byId("scale").textContent = `${newton} N is as long as ${(1000 * metresPerNewton * newton).toFixed(1)} mm.`;
+  byId("scale").textContent = forceLargest > 0
+    ? `${newton} N is as long as ${(1000 * metresPerNewton * newton).toFixed(1)} mm.`
+    : "Friction holds the object at rest: the forces are not determined.";
   strip((time) => { pause(); seek(time); });
   new ResizeObserver(rebuild).observe(byId("torques").parentElement);
   rebuild();
