@@ -1,5 +1,27 @@
-"""Every test computes in 64 bits."""
+"""Every test computes in 64 bits, and leaves room for the programs of those that follow."""
+
+from pathlib import Path
 
 import jax
+import pytest
+
+MAPPED = 30_000  # half of the memory areas that Linux grants a process by default
 
 jax.config.update("jax_enable_x64", True)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _programs_are_kept(request):
+    """Workers share compiled programs, and so does the next run: most of the suite's time is compiling."""
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        jax.config.update("jax_compilation_cache_dir", str(request.config.cache.mkdir("programs")))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+@pytest.fixture(autouse=True)
+def _room_for_programs():
+    """Each compiled program maps a thousand small areas of memory, and a process that runs out of them crashes."""
+    yield
+    areas = Path("/proc/self/maps")
+    if areas.exists() and len(areas.read_bytes().splitlines()) > MAPPED:
+        jax.clear_caches()
