@@ -6,6 +6,7 @@ Exit status 0 when the result is `ok`, 1 when the plan fails (its status is prin
 import os
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -136,7 +137,9 @@ def simulate(
 def formations(
     scene: SceneName,
     after: Annotated[str | None, typer.Option(help="A phase, by name or number: list what can follow its end.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for a picture of all ways, formations.svg and .png.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for a picture of all ways: formations.png, .svg, .pdf.")
+    ] = None,
 ) -> None:
     """List the formations of four contacts that hold at a configuration, and where their wires lead."""
     loaded = _scene(scene, None)
@@ -168,7 +171,7 @@ def formations(
     if folder is not None:
         from wholearm_jax.drawing import draw_ways
 
-        _save_figure(draw_ways(loaded, z, found), folder, "formations")
+        _save_figure(lambda: draw_ways(loaded, z, found), folder, "formations")
 
 
 @app.command()
@@ -204,7 +207,7 @@ def report(
 def execute(
     scene: SceneName,
     torque: TorqueFile,
-    out: Annotated[Path | None, typer.Option(help="Folder for execution.json, .csv, .png, .svg, model.xml.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for execution.json, .csv, figures and model.xml.")] = None,
     timestep: Annotated[float, typer.Option(min=1e-6, max=1e-2, help="Time step [s].")] = 2e-4,
     position: Annotated[float, typer.Option(min=0.0, help="Success: this near the predicted end [m].")] = 5e-4,
     angle: Annotated[float, typer.Option(min=0.0, help="Success: this near the predicted angle [rad].")] = 0.01,
@@ -410,9 +413,9 @@ def _draw_execution(done, folder: Path, video: bool) -> None:
 
     from wholearm_jax.drawing import animate, draw_execution, draw_execution_strip
 
-    _save_figure(draw_execution(done), folder, "execution")
+    _save_figure(lambda: draw_execution(done), folder, "execution")
     if video:
-        _save_figure(draw_execution_strip(done), folder, "frames")
+        _save_figure(lambda: draw_execution_strip(done), folder, "frames")
         animate(done).save(folder / "execution.gif", writer="pillow")  # which needs no further program
         plt.close("all")
 
@@ -423,20 +426,24 @@ def _draw(result, folder: Path) -> None:
 
     figures = {"plan": draw_strip, "result": draw_result} if trajectory(result) else {}  # no motion, nothing to draw
     for name, draw in figures.items():
-        _save_figure(draw(result), folder, name)
+        _save_figure(partial(draw, result), folder, name)
 
 
-def _save_figure(figure, folder: Path, name: str) -> None:
+def _save_figure(draw, folder: Path, name: str) -> None:
+    """Draw with the settings of a paper; write it to look at, and as vectors for the web and for print."""
     import io
 
     import matplotlib.pyplot as plt
 
+    from wholearm_jax.drawing import paper
     from wholearm_jax.writing import write_whole
 
-    for kind in ("png", "svg"):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=kind, dpi=150, bbox_inches="tight")
-        write_whole(folder / f"{name}.{kind}", buffer.getvalue())
+    with paper():
+        figure = draw().flat[0].figure
+        for kind, undated in (("png", {}), ("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format=kind, dpi=250, bbox_inches="tight", metadata=undated)
+            write_whole(folder / f"{name}.{kind}", buffer.getvalue())
     plt.close(figure)
 
 

@@ -222,7 +222,7 @@ def _settings(summary: dict[str, Any]) -> dict[str, str]:
     """How the result was made: all that the summary says beside the result itself."""
     known = {"status", "margin", "message", "phases", "scene", "stopped"}
     named = {"seconds": "time taken [s]", "rate_limit": "largest torque rate [N m/s]", "steps": "steps of descent"}
-    return {named[k] if k in named else k: _digits(v) for k, v in summary.items() if k not in known and v is not None}
+    return {str(named.get(k, k)): _digits(v) for k, v in summary.items() if k not in known and v is not None}
 
 
 def _colours() -> dict[str, dict[str, str]]:
