@@ -261,8 +261,9 @@ def animate(execution: Execution, frames_per_second: int = 25, ax: Axes | None =
     times = execution.course.time
     count = max(2, round(times[-1] * frames_per_second) + 1)
     shown = np.searchsorted(times, np.linspace(0, times[-1], count) - 1e-9)
-    figure = ax.get_figure(root=True) if ax else plt.figure(figsize=(4.8, 3.6), layout="constrained")
-    ax = ax or figure.add_subplot()
+    ax = ax or plt.figure(figsize=(4.8, 3.6), layout="constrained").add_subplot()
+    figure = ax.get_figure(root=True)
+    assert figure is not None
     reach = np.asarray(execution.prediction.scene.hand.length).max()
     across = np.abs(np.asarray(execution.prediction.scene.hand.joint)[:, 0]).max() + reach
 
