@@ -83,10 +83,10 @@ def optimise(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+    from wholearm_jax.optimiser import compile_ahead
     from wholearm_jax.optimiser import optimise as find
 
     begun = time.perf_counter()
-    _traced(scene, loaded)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bars = [progress.add_task(p.name, total=steps, state="waiting") for p in loaded.phases]
@@ -96,7 +96,9 @@ def optimise(
             progress.update(bars[step.phase], completed=step.step + 1, state=state)
 
         progress.update(bars[0], state="compiling")
-        found = find(loaded, knots=knots, steps=steps, rate_limit=rate_limit, callback=show)
+        compile_ahead(loaded, knots=knots)
+        traced = _traced(scene, loaded)
+        found = find(loaded, knots=knots, steps=steps, rate_limit=rate_limit, callback=show, traced=traced)
         for bar, why in zip(bars, found.stopped, strict=True):
             progress.update(bar, completed=steps, state=why)
     seconds = time.perf_counter() - begun
@@ -309,6 +311,8 @@ def _traced(name: str, scene):
 
     traced = trace(scene)
     for k, (phase, at) in enumerate(zip(scene.phases, traced, strict=True)):
+        if int(at.table.status) == 0:
+            continue
         rough = end_configuration(traced[k - 1]) if k > 0 else scene.start
         gap, length, unit = apart(phase.formation, at.wire.start, rough)
         where = "with the others, from this start"
@@ -322,8 +326,7 @@ def _traced(name: str, scene):
             if phase.formation.tangential[worst]:
                 raise _BadInput(f"{name}: {key}: {which} cannot stay in its place {where}: it is off by {size:.3g} m")
             raise _BadInput(f"{name}: {key}: {which} cannot touch {where}: a gap of {size:.3g} m stays open")
-        if at.table.status != 0:
-            break  # what follows a wire that cannot be followed has no start
+        break  # what follows a wire that cannot be followed has no start
     return traced
 
 

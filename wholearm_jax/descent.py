@@ -418,7 +418,7 @@ def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimis
 
     def again():
         share = d.share * SHORTER
-        nan = jnp.full((), jnp.nan)
-        return d._replace(p=moved(d.before, d.way, share, tables, limits), share=share, least=nan + d.least, apart=nan)
+        least, apart = (jnp.full_like(a, jnp.nan) for a in (d.least, d.apart))
+        return d._replace(p=moved(d.before, d.way, share, tables, limits), share=share, least=least, apart=apart)
 
     return jax.lax.cond(sound, onward, again)

@@ -137,7 +137,7 @@ def _way(scene, z, z_dot, names, chosen, toward: str) -> Way | None:
     """Trace one way; None where it leads nowhere."""
     coordinate, sign = COORDINATES.index(toward[:-1]), 1.0 if toward[-1] == "+" else -1.0
     nowhere = Heading(jnp.asarray(coordinate), jnp.asarray(sign), jnp.asarray(-1), jnp.asarray(0.0))
-    traced = prepare(_body(scene.object), scene.hand, scene.gravity, chosen, z, nowhere)
+    traced = prepare(body(scene.object), scene.hand, scene.gravity, chosen, z, nowhere)
     table = traced.table
     status, length = Status(int(table.status)), float(table.length)
     if status is Status.OK and length < SHORTEST:
@@ -160,9 +160,6 @@ def _way(scene, z, z_dot, names, chosen, toward: str) -> Way | None:
         pulls=bool(impulse.min() < -1e-9 * np.abs(impulse).max()),
         traced=traced,
     )
-
-
-_body = jax.jit(body)
 
 
 @jax.jit

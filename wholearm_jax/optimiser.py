@@ -9,7 +9,7 @@ import functools
 import itertools
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -23,7 +23,7 @@ from wholearm_jax.motion import Integration
 from wholearm_jax.plan import Result, Traced, describe, outcomes, require_x64, run, trace
 from wholearm_jax.reduction import blank
 from wholearm_jax.scene import Phase, Scene
-from wholearm_jax.schedule import Torque, padded
+from wholearm_jax.schedule import Torque, padded, rounded
 from wholearm_jax.shooting import Variables
 from wholearm_jax.squeeze import Bound, bound, holds
 from wholearm_jax.status import Status
@@ -104,29 +104,31 @@ def optimise(
     optimiser: optax.GradientTransformation | None = None,
     tolerance: float = 1e-3,
     callback: Callable[[Step], None] | None = None,
+    traced: tuple[Traced, ...] = (),
 ) -> Optimised:
     """Find the torque schedule with the largest compressive margin by gradient descent through the simulation.
 
     Each phase must arrive at its planned end in time, at rest or, where the next takes over, `moving`; `knots` torques
     a joint and phase, evenly spaced in time, are linear in between. The scene's
     torque limits hold, and `rate_limit` [N m/s] if given. `durations = (shortest, longest)` lets each phase choose its
-    own. `optimiser` replaces the interior point by any optax optimiser (`descent.projected`). A phase stops
-    when its margin comes within `tolerance` of the bound or no longer improves by that share, or after `steps`.
-    `callback` sees every step. Where no torque can hold a formation, nothing is searched and the status says so.
+    own. `optimiser` replaces the interior point by any optax optimiser (`descent.projected`). A phase stops when its
+    margin comes within `tolerance` of the bound or no longer improves by that share, or after `steps`. `callback` sees
+    every step; `traced` reuses the result of `trace`. Where no torque can hold a formation, nothing is searched and the
+    status says so.
     """
     require_x64()
-    joint = _groups(scene)
-    with ThreadPoolExecutor(1) as beside:
-        ready = [beside.submit(_compile, len(group), knots, _method(optimiser, len(group))) for group in joint]
-        traced = trace(scene)
-        tops = bounds(scene, traced=traced)
-        for one in ready:
-            one.result()
+    joint, rows = _groups(scene), rounded(knots * len(scene.phases))
+    ready = compile_ahead(scene, knots=knots, optimiser=optimiser)
+    traced = traced or trace(scene)
+    tops = bounds(scene, traced=traced)
+    for one in ready:
+        one.result()
     found, history, stopped = [], [], []
     for group in joint:
         parts = tuple(scene.phases[k] for k in group)
         before = found[-1].values[-1] if rate_limit is not None and found else None
-        task = _Task(group[0], parts, [traced[k] for k in group], [tops[k] for k in group], knots, steps, tolerance)
+        own = [traced[k] for k in group], [tops[k] for k in group]
+        task = _Task(group[0], parts, *own, knots, rows, steps, tolerance)
         limits = _limits(task, rate_limit, durations, before)
         schedules, why, taken = _optimise_group(task, limits, before, _method(optimiser, len(group)), callback)
         found += schedules
@@ -138,6 +140,14 @@ def optimise(
     torque = _in_turn(found)
     result = describe(scene, torque, traced, outcomes(scene, torque, traced, Integration()))
     return Optimised(scene, torque, result, tops, tuple(stopped), tuple(history))
+
+
+def compile_ahead(
+    scene: Scene, *, knots: int = 51, optimiser: optax.GradientTransformation | None = None
+) -> list[Future[None]]:
+    """Begin to compile the programs of `optimise` in threads of their own, as can be done while wires are traced."""
+    rows = rounded(knots * len(scene.phases))
+    return [_ahead(n, knots, rows, _method(optimiser, n)) for n in sorted({len(group) for group in _groups(scene)})]
 
 
 def _groups(scene: Scene) -> list[list[int]]:
@@ -156,6 +166,7 @@ class _Task:
     traced: list[Traced]
     tops: list[Bound]
     knots: int
+    rows: int  # of the whole plan's schedule: one of the same size shares its program
     steps: int
     tolerance: float
 
@@ -169,7 +180,7 @@ class _Task:
 
     @property
     def tables(self):
-        return jax.tree.map(lambda *a: jnp.stack(a), *(at.table for at in self.traced))
+        return _stacked([at.table for at in self.traced])
 
 
 def _optimise_group(task: _Task, limits: Limits, before, method, callback) -> tuple[list[Torque], str, list[Step]]:
@@ -230,18 +241,25 @@ def _descend(task: _Task, start: Variables, number: int, limits: Limits, method,
     return d.p, why, history
 
 
-def _compile(phases: int, knots: int, method) -> None:
-    """Compile the descent's programs, on blank tables, while the wires are being traced."""
-    if (phases, knots, method) in _COMPILED:
-        return
-    _COMPILED.add((phases, knots, method))
-    tables = jax.tree.map(lambda a: jnp.stack([a] * phases), blank(Resolution()))
+@functools.cache
+def _ahead(phases: int, knots: int, rows: int, method) -> Future[None]:
+    beside = ThreadPoolExecutor(1)
+    future = beside.submit(_compile, phases, knots, rows, method)
+    beside.shutdown(wait=False)  # the thread ends when it has done this
+    return future
+
+
+def _compile(phases: int, knots: int, rows: int, method) -> None:
+    """Run the descent's programs once, on blank tables."""
+    table = blank(Resolution())
+    tables = _stacked([table] * phases)
     plain = (np.full(2, np.inf), _ONE, _ONE, np.zeros((phases, knots), bool), np.ones(phases))
     limits = Limits(*(jnp.asarray(a) for a in plain))
     empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
     p = Variables(*(jnp.asarray(a) for a in empty))
     advance(begin(p, method), tables, limits, _HOW, method)
-    run(blank(Resolution()), _padded(_evenly(1.0, empty[0][0])), jnp.zeros(()), jnp.ones(()), Integration(), True)
+    zero, one = jnp.asarray(np.zeros(())), jnp.asarray(_ONE)
+    run(table, _padded(_evenly(1.0, empty[0][0]), rows), zero, one, Integration(), True)
 
 
 @functools.cache
@@ -250,7 +268,6 @@ def _method(optimiser, phases: int):
     return interior_point(phases) if optimiser is None else projected(optimiser)
 
 
-_COMPILED: set = set()
 _ONE = np.ones(())
 _HOW = Integration()
 LOST = 1e-6  # share of a step at which a descent gives up
@@ -260,7 +277,12 @@ def _evenly(duration: float, values) -> Torque:
     return Torque(jnp.asarray(np.linspace(0.0, float(duration), len(values))), jnp.asarray(values))
 
 
-_padded = jax.jit(padded)
+_padded = jax.jit(padded, static_argnames="multiple")
+
+
+@jax.jit
+def _stacked(tables):
+    return jax.tree.map(lambda *a: jnp.stack(a), *tables)
 
 
 def _schedules(task: _Task, p: Variables) -> list[Torque]:
@@ -272,12 +294,12 @@ def _schedules(task: _Task, p: Variables) -> list[Torque]:
 
 def _honest(task: _Task, p: Variables) -> tuple[bool, float]:
     """Whether a simulation of the schedules says `ok`, and the least margin over its bound."""
-    start, shares, fine, arriving, end = jnp.zeros(()), [], [], None, 0.0
-    schedule = _padded(_in_turn(_schedules(task, p)))
-    for phase, at, length, top in zip(task.phases, task.traced, np.exp(p.log_duration), task.bounds, strict=True):
-        end = end + length
+    start, shares, fine, arriving = 0.0, [], [], None
+    schedule = _padded(_in_turn(_schedules(task, p)), task.rows)
+    ends = np.cumsum(np.exp(np.asarray(p.log_duration)))
+    for phase, at, end, top in zip(task.phases, task.traced, ends, task.bounds, strict=True):
         one = run(at.table, schedule, start, end - start, Integration(), phase.arrive == "rest", arriving)
-        start = start + one.duration * one.motion.share[one.motion.count]
+        start += float(one.duration) * float(np.asarray(one.motion.share)[int(one.motion.count)])
         arriving = one.leaving if phase.arrive == "moving" else None
         fine.append(int(one.verdict.status) == Status.OK)
         shares.append(float(one.score.margin) / top)
@@ -333,7 +355,7 @@ def _in_turn(schedules: list[Torque]) -> Torque:
     """Schedules one after the other; a step where one follows another."""
     begins = np.cumsum([0.0, *(float(s.times[-1]) for s in schedules[:-1])])
     times = [begin + np.asarray(s.times) for begin, s in zip(begins, schedules, strict=True)]
-    return Torque(jnp.asarray(np.concatenate(times)), jnp.concatenate([s.values for s in schedules]))
+    return Torque(*(jnp.asarray(np.concatenate(rows)) for rows in (times, [s.values for s in schedules])))
 
 
 def _between(knots: int, entry: float, leave: float):

@@ -26,6 +26,7 @@ from wholearm_jax.verdict import Verdict, judge
 from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
 
 SLIPPING = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
+SAMPLED = 1024  # samples of a phase that one call computes: numbers of samples that differ share a program
 CONTINUITY = 1e-6  # metres and radians by which a phase may begin beside the end of the one before it
 
 
@@ -117,17 +118,19 @@ def prepare(scene_body, hand, gravity, formation, rough, heading, resolution: Re
     return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), Traced(wire, reduce_wire(mechanics, wire)))
 
 
-def run(table: Table, schedule: Torque, start, duration, how: Integration, at_rest: bool, arriving=None) -> Outcome:
-    """Simulate one phase from its wire's start, score it and judge it.
+def run(table: Table, schedule: Torque, start, duration, how: Integration, at_rest, arriving=None) -> Outcome:
+    """Simulate one phase from its wire's start, score it and judge it: it must end at rest if `at_rest`.
 
     `arriving` is `z_dot` (SI) at the end of the phase before, for a change of formation while moving (None: at rest).
     """
-    arriving = jnp.zeros(5, table.breaks.dtype) if arriving is None else arriving
+    dtype = table.breaks.dtype
+    arriving = jnp.asarray(np.zeros(5), dtype) if arriving is None else arriving
+    start, duration, at_rest = jnp.asarray(start, dtype), jnp.asarray(duration, dtype), jnp.asarray(at_rest)
     return _run(table, schedule, start, duration, arriving, how, at_rest)
 
 
 @eqx.filter_jit
-def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, at_rest: bool) -> Outcome:
+def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, at_rest) -> Outcome:
     seen = window(schedule, start, duration)
     entered = change(table, arriving)
     motion = move(table, seen, duration, how=how, speed=jnp.maximum(entered.speed, 0.0))
@@ -139,7 +142,7 @@ def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integra
     return Outcome(start, duration, entered, motion, scored, verdict, leaving)
 
 
-_body, _padded = jax.jit(body), jax.jit(padded)
+_padded = jax.jit(padded, static_argnames="multiple")
 
 
 @jax.jit
@@ -157,7 +160,7 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     function's size, is below `tolerance`; pieces are added likewise. What cannot be traced says so in
     `Traced.table.status`, and what follows it cannot be trusted.
     """
-    solid, rough, found = _body(scene.object), scene.start, []
+    solid, rough, found = body(scene.object), scene.start, []
     for phase in scene.phases:
         traced = _refined(solid, scene, phase, rough, resolution, tolerance)
         found.append(_joined(traced, rough) if found else traced)
@@ -359,15 +362,17 @@ def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shar
 
 def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
     """Every phase at `samples` evenly spaced times; a phase that failed stops there, and later ones are left out."""
-    found, schedule = [], _padded(result.torque)
+    found, schedule, rows = [], _padded(result.torque), -(-samples // SAMPLED) * SAMPLED
     for phase in result.phases:
         if int(phase.traced.table.status) != Status.OK:
             break
         left = phase.arrive == "moving" or phase.status is not Status.OK
         stop = (phase.time - phase.start) / phase.duration if left else 1.0
-        shares = jnp.linspace(0.0, stop, samples)
-        start, duration = jnp.asarray(phase.start), jnp.asarray(phase.duration)
-        found.append(sample(phase.traced.table, schedule, start, duration, phase.outcome.motion, shares))
+        shares = np.full(rows, stop)
+        shares[:samples] = np.linspace(0.0, stop, samples)
+        outcome = phase.outcome
+        course = sample(phase.traced.table, schedule, outcome.start, outcome.duration, outcome.motion, shares)
+        found.append(jax.tree.map(lambda a: a[:samples], jax.device_get(course)))
         if phase.status is not Status.OK:
             break
     return tuple(found)

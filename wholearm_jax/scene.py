@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -210,6 +211,7 @@ def mass_properties(vertices: Float[Array, "capacity 2"], count: Int[Array, ""])
     return MassProperties(area, centroid + origin, polar - area * centroid @ centroid)
 
 
+@jax.jit
 def body(shape: Polygon) -> Body:
     """The polygon about its centre of mass, with the inertia of a uniform density unless the scene gives its own."""
     uniform = mass_properties(shape.vertices, shape.count)

@@ -50,9 +50,14 @@ def has_steps(schedule: Torque, start: float, end: float) -> bool:
     return bool(np.any((stepped > start) & (stepped < end)))
 
 
+def rounded(rows: int, multiple: int = 64) -> int:
+    """The next multiple: as long as `padded` makes a schedule of `rows`."""
+    return -(-rows // multiple) * multiple
+
+
 def padded(schedule: Torque, multiple: int = 64) -> Torque:
     """The same schedule with its last row repeated, so that schedules of like length share a compiled program."""
-    missing = -schedule.times.shape[0] % multiple
+    missing = rounded(schedule.times.shape[0], multiple) - schedule.times.shape[0]
     ramp = schedule.times[-1] + (schedule.times[-1] - schedule.times[0]) * jnp.arange(1, missing + 1)
     rows = jnp.broadcast_to(schedule.values[-1], (missing, 2))
     return Torque(jnp.concatenate([schedule.times, ramp]), jnp.concatenate([schedule.values, rows]))

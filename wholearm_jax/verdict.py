@@ -4,7 +4,7 @@ import math
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.forces import Score, slack
 from wholearm_jax.motion import Motion
@@ -28,7 +28,7 @@ class Verdict(eqx.Module):
     contact: Int[Array, ""]
 
 
-def judge(table: Table, motion: Motion, score: Score, at_rest: bool, entered: Change) -> Verdict:
+def judge(table: Table, motion: Motion, score: Score, at_rest: Bool[Array, ""], entered: Change) -> Verdict:
     """Decide the status of a phase that must end at rest (`at_rest`) or may end moving.
 
     The earliest trouble counts: a wire that cannot be traced, an impulse that would pull (or throw the object back)
@@ -39,11 +39,9 @@ def judge(table: Table, motion: Motion, score: Score, at_rest: bool, entered: Ch
     slow = w <= ARRIVAL_SPEED * table.length
     late = share >= 1 - ARRIVAL_SPEED
     ended = motion.status
-    if at_rest:
-        held = (ended == Status.STUCK) | ((ended == Status.REVERSED) & late) | (ended == Status.LEFT_FORMATION)
-        arrived = near & slow & (held | (ended == Status.OK))
-    else:
-        arrived = near & ((ended == Status.LEFT_FORMATION) | (ended == Status.OK))
+    there = (ended == Status.LEFT_FORMATION) | (ended == Status.OK)
+    held = (ended == Status.STUCK) | ((ended == Status.REVERSED) & late)
+    arrived = near & jnp.where(at_rest, slow & (there | held), there)
     finish = jnp.where(arrived, int(Status.OK), jnp.where(ended == Status.OK, int(Status.NOT_REACHED), ended))
     lost = jnp.isfinite(score.lost)
     status = jnp.where(lost, int(Status.CONTACT_LOST), finish)
