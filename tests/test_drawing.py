@@ -5,7 +5,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from wholearm_jax.drawing import COLUMN, draw_forces, draw_pose, draw_result, draw_strip, draw_torques, paper
+from wholearm_jax.drawing import COLUMN, PAPER, draw_forces, draw_pose, draw_result, draw_strip, draw_torques
 from wholearm_jax.palette import CONTACT_COLOURS, DASHES, contact_styles
 from wholearm_jax.plan import simulate
 from wholearm_jax.scene_file import load, parse, to_dict
@@ -60,13 +60,11 @@ def test_pose_numbers_its_vertices(pushed):
     assert [text.get_text() for text in ax.texts] == [str(k) for k in range(7)]
 
 
-def test_paper_changes_settings_only_within(pushed):
-    before = dict(mpl.rcParams)
-    with paper():
+def test_settings_of_a_paper(pushed):
+    with plt.rc_context(PAPER):
         figure = draw_result(pushed)[0].figure
         assert mpl.rcParams["font.size"] == 8
         assert mpl.rcParams["pdf.fonttype"] == 42
-    assert dict(mpl.rcParams) == before
     assert figure.get_size_inches()[0] == COLUMN
 
 

@@ -49,7 +49,7 @@ def search(scene: Scene, *, longest: float = 10.0) -> Searched:
 
     The paper's section 3.1 (derivation, section 10). Raises RuntimeError without float64.
 
-    >>> found = wa.search(wa.load("heptagon"))
+    >>> found = wa.search(wa.load("hexagon"))
     >>> found.result.status.label, found.torque.values.shape
     ('ok', (4, 2))
     """

@@ -438,10 +438,10 @@ def _save_figure(draw, folder: Path, name: str) -> None:
 
     import matplotlib.pyplot as plt
 
-    from wholearm_jax.drawing import paper
+    from wholearm_jax.drawing import PAPER
     from wholearm_jax.writing import write_whole
 
-    with paper():
+    with plt.rc_context(PAPER):
         figure = draw().flat[0].figure
         for kind, undated in (("png", {}), ("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
             buffer = io.BytesIO()

@@ -1,7 +1,7 @@
 """Figures: poses, torques, contact forces, how a descent went, executions.
 
 Every function draws on the axes it is given, or on new ones, and returns them, so that figures are composed as with
-matplotlib alone. Sizes of text and lines come from matplotlib's settings; `paper` has those of the field's papers.
+matplotlib alone. Sizes of text and lines come from matplotlib's settings; `PAPER` has those of the field's papers.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
     from wholearm_jax.optimiser import Optimised
 
 COLUMN, PAGE = 3.5, 7.16  # widths of one column and of two in the field's journals [inch]
-_PAPER: dict[Any, Any] = {
+
+PAPER: dict[Any, Any] = {
     "font.family": "STIXGeneral",  # comes with matplotlib, and looks like the journals' Times
     "mathtext.fontset": "stix",
     "font.size": 8,
@@ -43,15 +44,10 @@ _PAPER: dict[Any, Any] = {
     "pdf.fonttype": 42,  # text stays text: journals refuse other fonts
     "svg.hashsalt": "wholearm_jax",  # the same figure is the same file
 }
+"""Settings of matplotlib for a paper: `with plt.rc_context(PAPER)`, or `plt.rcParams.update(PAPER)` once and for all.
+Figures are then `COLUMN` or `PAGE` inches wide, with letters of 7 and 8 points."""
+
 _INK, _FILL, _PALE = "#222222", "#E8EEF4", "#999999"
-
-
-def paper():
-    """Settings of matplotlib for a paper, as a context: `with paper(): draw_result(result)`.
-
-    8 points in a face like Times, thin lines, text kept as text in PDF; figures are `COLUMN` or `PAGE` inches wide.
-    """
-    return plt.rc_context(_PAPER)
 
 
 def draw_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbers: bool = False) -> Axes:
@@ -171,6 +167,7 @@ def draw_forces(result: Result, ax: Axes | None = None, *, legend: bool = True) 
                 label = label and r"its $\mu c_n - |c_t|$"
                 ax.plot(course.time, slack, color=colour, ls=":", label=label)
     ax.set_ylabel("contact force $c_n$ [N]")
+    ax.autoscale(axis="y")  # with what other axes hold that share this one
     low, high = ax.get_ylim()
     ax.set_ylim(min(low, 0.0) - 0.14 * (high - min(low, 0.0)), high)
     _mark_margin(result, ax)

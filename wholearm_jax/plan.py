@@ -166,7 +166,7 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     >>> [wa.Status(int(one.table.status)).label for one in traced]
     ['ok', 'ok']
     >>> print(f"{float(traced[0].table.length):.2f} object radii")
-    1.34 object radii
+    1.33 object radii
     """
     solid, rough, found = body(scene.object), scene.start, []
     for phase in scene.phases:
