@@ -10,7 +10,19 @@ from wholearm_jax import plan
 
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
-    *("status", "scene", "contacts", "system", "newton", "wire", "reduction", "schedule", "motion", "forces"),
+    *(
+        "status",
+        "scene",
+        "contacts",
+        "system",
+        "elimination",
+        "newton",
+        "wire",
+        "reduction",
+        "schedule",
+        "motion",
+        "forces",
+    ),
     *("verdict", "plan", "squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
     *("free_bodies", "execution", "perturbation"),
     *("writing", "scene_file", "result_file", "palette", "report", "drawing", "__init__", "command"),

@@ -13,6 +13,7 @@ from wholearm_jax.formations import start_configuration
 from wholearm_jax.motion import Integration
 from wholearm_jax.reduction import change, horner, powers
 from wholearm_jax.scene import body
+from wholearm_jax.scene import heading as wa_heading
 from wholearm_jax.system import system
 
 FLIGHTS = ("flight", "passage")
@@ -99,3 +100,23 @@ def test_a_change_that_would_throw_the_object_back_is_refused_by_name():
 
 def _flying(phase):
     return type(phase)(phase.name, phase.formation, phase.heading, phase.duration, arrive="moving")
+
+
+@pytest.mark.parametrize("x", [0.0, -0.01, -0.015, -0.018])
+def test_a_motion_cut_in_two_goes_on_as_it_was(x):
+    """The second part is entered fast and its wire is a fraction of a step: no overshoot, no impulse, the same end."""
+    scene = wa.load("heptagon")
+    slide = scene.phases[0]
+    torque = wa.Torque(jnp.array([0.0, 0.6, 1.2]), jnp.array([[0.55, -0.24], [0.55, -0.24], [0.55, -0.24]]))
+
+    def pushed(*untils):
+        headings = [slide.heading if u is None else wa_heading("x-", {"x": u}) for u in untils]
+        duration = jnp.asarray(1.2 / len(untils))
+        parts = [type(slide)("slide", slide.formation, h, duration, arrive="moving") for h in headings]
+        return wa.simulate(eqx.tree_at(lambda s: s.phases, scene, tuple(parts)), torque)
+
+    whole, cut = pushed(None), pushed(x, None)
+    assert [p.status for p in cut.phases] == [whole.status, whole.status] == [wa.Status.OK] * 2
+    assert cut.phases[1].time == pytest.approx(whole.phases[0].time, rel=1e-8)
+    assert np.abs(cut.phases[1].impulses).max() < 1e-12
+    np.testing.assert_allclose(cut.phases[1].outcome.leaving, whole.phases[0].outcome.leaving, rtol=1e-7)

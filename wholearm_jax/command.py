@@ -36,6 +36,7 @@ def main() -> None:
     os.environ.setdefault("MPLBACKEND", "agg")
     jax.config.update("jax_enable_x64", True)
     _keep_compiled()
+    _compile_quickly()
     from wholearm_jax.scene_file import SceneError
 
     try:
@@ -52,6 +53,16 @@ def _keep_compiled() -> None:
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     jax.config.update("jax_compilation_cache_dir", os.path.join(home, "wholearm_jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _compile_quickly() -> None:
+    """Have XLA emit kernels in its older way: half of the compile time, at a tenth more run time for one scene.
+
+    XLA refuses flags that it does not know: this is for the version that was measured.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if jax.__version_info__[:2] == (0, 10) and "xla_cpu_use_fusion_emitters" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
 
 
 @app.command()

@@ -415,12 +415,11 @@ def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimis
     def onward():
         flat, unravel = ravel_pytree(d.p)
         way, state = optimiser.update(jnp.zeros_like(flat), d.state, flat, linear=linear)
-        way = unravel(way)
-        return Descent(moved(d.p, way, 1.0, tables, limits), state, d.p, way, jnp.ones(()), least, apart)
+        return Descent(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart)
 
     def again():
-        share = d.share * SHORTER
         least, apart = (jnp.full_like(a, jnp.nan) for a in (d.least, d.apart))
-        return d._replace(p=moved(d.before, d.way, share, tables, limits), share=share, least=least, apart=apart)
+        return d._replace(share=d.share * SHORTER, least=least, apart=apart)
 
-    return jax.lax.cond(sound, onward, again)
+    after = jax.lax.cond(sound, onward, again)
+    return after._replace(p=moved(after.before, after.way, after.share, tables, limits))

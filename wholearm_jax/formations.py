@@ -21,6 +21,7 @@ from wholearm_jax.scene import COORDINATES, Heading, Phase, Scene, body, contact
 from wholearm_jax.squeeze import Bound, bound, hold
 from wholearm_jax.status import Status
 from wholearm_jax.system import system
+from wholearm_jax.verdict import PULL
 
 TOUCHING = 1e-7  # gap, in the object's radius, below which a contact touches
 SHORTEST = 1e-3  # wire length, in the object's radius, below which a way leads nowhere
@@ -157,7 +158,7 @@ def _way(scene, z, z_dot, names, chosen, toward: str) -> Way | None:
         static=static,
         bound=top,
         speed=float(entered.speed),
-        pulls=bool(impulse.min() < -1e-9 * np.abs(impulse).max()),
+        pulls=bool(impulse.min() < -PULL * float(entered.size)),
         traced=traced,
     )
 

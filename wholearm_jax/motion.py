@@ -30,6 +30,7 @@ from wholearm_jax.reduction import Table, horner, powers
 from wholearm_jax.schedule import Window, interval, torque_in
 from wholearm_jax.status import Status
 
+LANDINGS = 16  # Newton steps, or halvings, to the place where a stage ends
 ADJOINTS = {
     "none": dfx.DirectAdjoint(),
     "both": dfx.DirectAdjoint(),  # forward and reverse mode
@@ -75,23 +76,26 @@ class Motion(eqx.Module):
 
 
 class _FirstStep(dfx.AbstractAdaptiveStepSizeController):
-    """A controller whose first step is a 32nd of the phase.
+    """A controller whose first step is a 32nd of the phase, or half of the way to the piece's end at its speed.
 
     diffrax would check a first step passed to `diffeqsolve` by a host callback, and programs that call back to the
     host are not kept in JAX's compilation cache.
     """
 
     controller: dfx.PIDController
+    way: Float[Array, ""]
     rtol: float
     atol: float
     norm: Callable
 
     def wrap(self, direction):
         inner = self.controller.wrap(direction)
-        return _FirstStep(controller=inner, rtol=self.rtol, atol=self.atol, norm=self.norm)
+        return _FirstStep(controller=inner, way=self.way, rtol=self.rtol, atol=self.atol, norm=self.norm)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        first = jnp.full_like(t0, 1 / 32)
+        speed = stop_gradient(y0[1])
+        half = jnp.where(speed > 0, self.way / jnp.where(speed > 0, 2 * speed, 1.0), 1.0)
+        first = jnp.clip(half, jnp.finfo(t0.dtype).eps, 1 / 32).astype(t0.dtype)
         return self.controller.init(terms, t0, t1, y0, first, args, func, error_order)
 
     def adapt_step_size(self, *at):
@@ -184,6 +188,7 @@ def move(
     )
 
 
+@jax.jit
 def acceleration(table: Table, seen: Window, duration, piece, row, share, s, w):
     """`dw/du` for forward travel in a piece and a torque interval."""
     panel, xi = powers(table, piece, s)
@@ -192,6 +197,7 @@ def acceleration(table: Table, seen: Window, duration, piece, row, share, s, w):
     return duration**2 * (a[0] + a[3] * tau[0] + a[4] * tau[1]) + duration * a[2] * w + a[1] * w**2
 
 
+@jax.jit
 def single_step(table, seen, duration, how: Integration, piece, row, share, y, length):
     """One step of the solver from `y = (s, w)` at a share of the phase, within a piece and a torque interval."""
     solver = eqx.tree_at(lambda x: x.scan_kind, how.solver, "bounded", is_leaf=lambda x: x is None)
@@ -247,10 +253,8 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     share, s, w = (nodes[start + kept, k] for k in range(3))
     w = jnp.where(kept > 0, w, y0[1])  # a node at a chart's end holds the speed in the chart before
     last_time = jnp.where(overshot, saved_times[jnp.maximum(taken - 1, 0)], 1.0)
-    last_y = jnp.where(overshot, saved[jnp.maximum(taken - 1, 0)], y0 * 0 + 1.0)
-    passed = overshot & (last_y[0] > goal)
-    landed = _land(table, seen, duration, how, state.piece, (share, s, w), last_time, goal, passed, overshot)
-    land_share, land_s, land_w, astray = landed
+    landed = _land(table, seen, duration, how, state.piece, (share, s, w), last_time, goal, floor, overshot)
+    land_share, land_s, land_w, passed, astray = landed
     state = _append(state, overshot, land_share, land_s, land_w, w, held=False)
     onward = passed & ~last
     factor = table.factor[jnp.minimum(state.piece + 1, table.factor.shape[0] - 1)]
@@ -302,9 +306,11 @@ def _integrate(table, seen, duration, how, state, final, goal, floor):
     inputs = (table, seen, duration, state.share, jnp.stack([state.s, state.w]), final, goal)
     knots = seen.share
 
+    way = stop_gradient(goal - state.s)
+
     def adaptive(knots):
         errors = dfx.PIDController(rtol=how.tolerance, atol=how.tolerance)
-        errors = _FirstStep(controller=errors, rtol=how.tolerance, atol=how.tolerance, norm=errors.norm)
+        errors = _FirstStep(controller=errors, way=way, rtol=how.tolerance, atol=how.tolerance, norm=errors.norm)
         return dfx.ClipStepSizeController(errors, step_ts=knots, jump_ts=knots if how.steps else None)
 
     if how.adjoint in ("none", "forward"):
@@ -367,16 +373,14 @@ def _departure(table, seen, state):
     return jnp.where(jnp.isfinite(at), jnp.where(jnp.isfinite(at), at, 0.0), 1.0), verdict
 
 
-def _land(table, seen, duration, how, piece, node, end, goal, passed, wanted):
-    """Retake the last step from `node` with the length that lands on `s = goal` (`passed`) or on `w = 0`.
+def _land(table, seen, duration, how, piece, node, end, goal, floor, wanted):
+    """Retake the last step from `node` with the length that lands on `s = goal` or on `w = 0`, whichever comes first.
 
-    Returns where it lands, and whether it went astray: no length within the step lands there.
+    Returns where it lands, whether on the goal, and whether it went astray: no length within the step lands there.
     """
     share, s, w = node
     longest = jnp.where(wanted, end - share, 0.0)
     row = interval(seen, stop_gradient(share + longest / 2))
-    target = jnp.where(passed, jnp.where(jnp.isfinite(goal), goal, 0.0), 0.0)
-    which = jnp.where(passed, 0, 1)
 
     def field(share, y, args):
         table, seen, duration = args
@@ -387,22 +391,31 @@ def _land(table, seen, duration, how, piece, node, end, goal, passed, wanted):
         return single_step(table, seen, duration, how, piece, row, share, y, length)
 
     args = (table, seen, duration)
-    fixed = stop_gradient((share, jnp.stack([s, w]), args, target, longest))
+    fixed = stop_gradient((share, jnp.stack([s, w]), args, longest))
+    goal_now = stop_gradient(goal)
+
+    def beyond(y):
+        """Whether the goal is passed by more than the speed has fallen below rest, and by how much."""
+        passing, resting = y[0] - goal_now, floor - y[1]
+        return passing >= resting, jnp.maximum(passing, resting)
 
     def narrow(_, bracket):
         """Newton on the step's length, bisecting where it would leave the bracket."""
         low, high, length = bracket
         y = step(fixed[0], length, fixed[1], fixed[2])
-        miss = jnp.where(passed, y[0] - fixed[3], -y[1])
+        passed, miss = beyond(y)
         rate = field(fixed[0] + length, y, fixed[2])
         rate = jnp.where(passed, rate[0], -rate[1])
         low, high = jnp.where(miss < 0, length, low), jnp.where(miss < 0, high, length)
         guess = length - miss / jnp.where(rate == 0, 1.0, rate)
         return low, high, jnp.where((guess >= low) & (guess <= high), guess, (low + high) / 2)
 
-    _, _, length = jax.lax.fori_loop(0, 12, narrow, (0 * fixed[4], fixed[4], fixed[4] / 2))
+    _, _, length = jax.lax.fori_loop(0, LANDINGS, narrow, (0 * fixed[3], fixed[3], fixed[3] / 2))
     y = step(share, length, jnp.stack([s, w]), args)
     rate = stop_gradient(field(share + length, y, args))
+    passed = wanted & beyond(stop_gradient(y))[0]
+    target = jnp.where(passed, jnp.where(jnp.isfinite(goal), goal, 0.0), 0.0)
+    which = jnp.where(passed, 0, 1)
     pace = jnp.where(wanted & (rate[which] != 0), rate[which], 1.0)
     late = jnp.where(wanted, (target - y[which]) / pace, 0.0)
     astray = wanted & ~(jnp.abs(late) <= longest)
@@ -412,5 +425,6 @@ def _land(table, seen, duration, how, piece, node, end, goal, passed, wanted):
         share + length + late,
         jnp.where(passed, target, y[0]),
         jnp.where(passed, y[1], 0.0),
+        passed,
         astray,
     )

@@ -1,6 +1,6 @@
 """Newton's method for small square systems, with exact first derivatives of the root.
 
-The iterations run on constants; one further step, taken with the Jacobian frozen at the root, carries the derivatives:
+The iterations run on constants; one further step, with the last iteration's inverse, carries the derivatives:
 for `F(z, p) = 0` it returns `z - J^-1 F(z, p)`, whose derivative is `-J^-1 dF/dp`, the implicit function theorem.
 Second derivatives of the root are not carried.
 """
@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
+
+from wholearm_jax.elimination import inverse, times
 
 
 class Root(NamedTuple):
@@ -37,11 +39,12 @@ def newton(function: Callable, z: Float[Array, "n"], *parameters, steps: int = 2
     def step(state):
         z, _, _, count, _ = state
         jacobian, value = jax.jacfwd(twice, has_aux=True)(z)
-        move = -jnp.linalg.solve(jacobian, value)
+        inverted, _ = inverse(jacobian)
+        move = -times(inverted, value)
         move = jnp.where(jnp.isfinite(move), move, 0.0)
         size = jnp.abs(move).max()
         move = move * jnp.minimum(1.0, longest / jnp.maximum(size, longest * eps))
-        return z + move, jacobian, jnp.abs(value).max(), count + 1, size
+        return z + move, inverted, jnp.abs(value).max(), count + 1, size
 
     def going(state):
         _, _, residual, count, size = state
@@ -49,7 +52,7 @@ def newton(function: Callable, z: Float[Array, "n"], *parameters, steps: int = 2
 
     far = jnp.asarray(jnp.inf, z.dtype)
     start = (stop_gradient(z), jnp.eye(z.shape[0], dtype=z.dtype), far, jnp.asarray(0), far)
-    z, jacobian, residual, count, _ = jax.lax.while_loop(going, step, start)
+    z, inverted, residual, count, _ = jax.lax.while_loop(going, step, start)
     residual = jnp.where(jnp.isfinite(residual), residual, jnp.inf)
-    correction = jnp.linalg.solve(stop_gradient(jacobian), function(stop_gradient(z), *parameters))
+    correction = times(stop_gradient(inverted), function(stop_gradient(z), *parameters))
     return Root(z - jnp.where(jnp.isfinite(correction), correction, 0.0), residual, count)

@@ -20,6 +20,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.contacts import constraint_curvature, constraint_rows, slip_rows
+from wholearm_jax.elimination import inverse, times
 from wholearm_jax.status import Status
 from wholearm_jax.system import System, configuration_unit
 from wholearm_jax.wire import Resolution, Wire, chebyshev
@@ -86,11 +87,9 @@ def balance(system: System, z, x, bend, slip_sign, joint_sign):
 def along_wire(system: System, z, u):
     """`x = dz/ds` and `x' = d2z/ds2` in the chart with direction `u`: `G x = 0`, `u.x = 1`, `G x' = -x^T H x`."""
     rows = jnp.concatenate([constraint_rows(system.contacts, z), u[None]])
-    unit = jnp.zeros(5, z.dtype).at[4].set(1.0)
-    x = jnp.linalg.solve(rows, unit)
-    left = -constraint_curvature(system.contacts, z, x)
-    bend = jnp.linalg.solve(rows, jnp.concatenate([left, jnp.zeros(1, z.dtype)]))
-    return x, bend
+    inverted, _ = inverse(rows)
+    x = inverted[:, 4]
+    return x, -times(inverted[:, :4], constraint_curvature(system.contacts, z, x))
 
 
 def reduce_wire(system: System, wire: Wire) -> Table:
@@ -105,15 +104,16 @@ def reduce_wire(system: System, wire: Wire) -> Table:
         matrix, right = balance(system, z, x, bend, slip_sign, joint_sign)
         smooth, _ = balance(system, z, x, bend, 0 * slip_sign, joint_sign)
         back, resting = balance(system, z, x, bend, -slip_sign, -joint_sign)
-        inverse = jnp.linalg.solve(matrix, jnp.eye(5, dtype=z.dtype))
-        solution = inverse @ right
-        behind = jnp.linalg.solve(back, resting[:, jnp.array([0, 3, 4])])
         # Friction may turn the determinant's sign only by passing through a singular matrix.
-        with_friction, without, turned = jnp.linalg.det(stop_gradient(jnp.stack([matrix, smooth, back])))
+        inverted, determinants = jax.vmap(inverse)(jnp.stack([matrix, back, stop_gradient(smooth)]))
+        with_friction, turned, without = stop_gradient(determinants)
         upright = with_friction * without
-        condition = jnp.abs(matrix).sum(0).max() * jnp.abs(inverse).sum(0).max()
-        entry = inverse * system.inertia
-        return entry, (x, solution[0], solution[1:], behind[0] * (turned / without) ** 2, condition, upright)
+        ahead, behind = inverted[0], inverted[1, 0]
+        solution = times(ahead, right)
+        behind = times(resting[:, jnp.array([0, 3, 4])].T, behind)
+        condition = jnp.abs(matrix).sum(0).max() * jnp.abs(ahead).sum(0).max()
+        entry = ahead * system.inertia
+        return entry, (x, solution[0], solution[1:], behind * (turned / without) ** 2, condition, upright)
 
     entry, found = jax.vmap(node)(place, chart, xi, turn)
     x, ahead, force, behind, condition, upright = (a[:-1].reshape(*shape, *a.shape[1:]) for a in found)
@@ -168,10 +168,14 @@ def blank(resolution: Resolution, contacts: int = 4) -> Table:
 
 
 class Change(eqx.Module):
-    """Entering a formation with speed: `ds/dt` [1/s] after the impact and the contacts' impulses [N s]."""
+    """Entering a formation with speed: `ds/dt` [1/s] after the impact and the contacts' impulses [N s].
+
+    `size` [N s] is the largest sum of magnitudes that makes up an impulse: against it rounding is judged.
+    """
 
     speed: Float[Array, ""]
     impulse: Float[Array, "slots"]
+    size: Float[Array, ""]
 
 
 def change(table: Table, z_dot: Float[Array, "5"]) -> Change:
@@ -185,16 +189,20 @@ def change(table: Table, z_dot: Float[Array, "5"]) -> Change:
     `z_dot_plus = x v` and compressive `p`, what is lost is that of `z_dot_plus - z_dot_minus` and the work of friction.
     """
     after = table.entry @ z_dot
-    return Change(after[0], after[1:])
+    return Change(after[0], after[1:], (jnp.abs(table.entry) @ jnp.abs(z_dot))[1:].max())
 
 
 def powers(table: Table, piece: Int[Array, ""], s: Float[Array, ""]) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The panel of `piece` that serves `s` (the nearest one beyond the piece's ends) and the panel coordinate."""
+    """The panel of `piece` that serves `s` (the nearest one beyond the piece's ends) and the panel coordinate.
+
+    More than a panel beyond the piece its functions stay what they are there: only steps that will be taken again, and
+    intervals of an optimisation under way, come so far.
+    """
     low, high = table.breaks[piece], table.breaks[piece + 1]
     width = jnp.where(high > low, high - low, 1.0)
     share = (s - low) / width * table.panels[piece]
     local = jnp.clip(jnp.floor(jax.lax.stop_gradient(share)), 0, jnp.maximum(table.panels[piece] - 1, 0))
-    return table.first[piece] + local.astype(int), 2 * (share - local) - 1
+    return table.first[piece] + local.astype(int), jnp.clip(2 * (share - local) - 1, -3.0, 3.0)
 
 
 def horner(coefficients: Float[Array, "powers ..."], xi: Float[Array, ""]) -> Float[Array, "..."]:

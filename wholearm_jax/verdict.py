@@ -17,7 +17,7 @@ ARRIVAL_SPEED = math.sqrt(12 * ARRIVAL)
 rest-to-rest motion) ends within `ARRIVAL` of a length. Nearer to the end time and position do not fix the speed better
 than this square root."""
 
-PULL = 1e-9  # share of the largest impulse by which one may be negative for rounding
+PULL = 1e-9  # share of `Change.size` by which an impulse may be negative for rounding
 
 
 class Verdict(eqx.Module):
@@ -47,7 +47,7 @@ def judge(table: Table, motion: Motion, score: Score, at_rest: Bool[Array, ""], 
     status = jnp.where(lost, int(Status.CONTACT_LOST), finish)
     traced = table.status == 0
     room = slack(table, entered.impulse)  # impulses have the cones of forces
-    pulls = room.min() < -PULL * jnp.abs(entered.impulse).max()
+    pulls = room.min() < -PULL * entered.size
     back = entered.speed < 0
     refused = pulls | back
     early = jnp.where(pulls, int(Status.CONTACT_LOST), int(Status.REVERSED))

@@ -22,7 +22,8 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.contacts import constraint_rows, constraints, frame, frames, placed, slips
+from wholearm_jax.contacts import constraint_rows, constraints, frames, placed, slips
+from wholearm_jax.elimination import inverse, solve, times
 from wholearm_jax.newton import newton
 from wholearm_jax.scene import Heading
 from wholearm_jax.status import Status
@@ -129,9 +130,19 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
 
 def tangent(system: System, z: Float[Array, "5"], hint: Float[Array, "5"]) -> Float[Array, "5"]:
     """Unit null vector of `G` with a positive component along `hint`."""
-    rows = jnp.concatenate([constraint_rows(system.contacts, z), hint[None]])
-    x = jnp.linalg.solve(rows, jnp.zeros(5, z.dtype).at[4].set(1.0))
-    return x / jnp.sqrt(x @ x)
+    return _oriented_tangent(system, z, hint)[0]
+
+
+def _oriented_tangent(system, z, hint):
+    """The unit tangent `x` and `det [G; x]`: the product of singular values, which changes sign where wires meet."""
+    inverted, determinant = inverse(jnp.concatenate([constraint_rows(system.contacts, z), hint[None]]))
+    size = jnp.sqrt((inverted[:, 4] ** 2).sum())
+    return inverted[:, 4] / size, determinant * size  # hint = x / size + what the rows of G span
+
+
+def _speeds(system, z, x):
+    """What reverses at kinks: the slips of the contacts and the joints' speeds."""
+    return jnp.concatenate([slips(system.contacts, z, x), x[3:]])
 
 
 def _watch(system, heading, z):
@@ -149,12 +160,12 @@ def _project(system, rough):
 
     def least(z):
         rows = constraint_rows(fixed.contacts, z)
-        move = -rows.T @ jnp.linalg.solve(rows @ rows.T, constraints(fixed.contacts, z))
+        move = -times(rows.T, solve(times(rows, rows.T), constraints(fixed.contacts, z)))
         move = jnp.where(jnp.isfinite(move), move, 0.0)
         return z + move * jnp.minimum(1.0, 0.3 / jnp.maximum(jnp.abs(move).max(), 1e-30))
 
     z = jax.lax.fori_loop(0, 12, lambda _, z: least(z), far)
-    hint = _null(constraint_rows(fixed.contacts, z))
+    hint = _null(fixed, z)
 
     def nearest(z, system, rough):
         return jnp.concatenate([constraints(system.contacts, z), (tangent(system, z, hint) @ (z - rough))[None]])
@@ -175,14 +186,17 @@ def _misplaced(system, z):
     return jnp.any(beyond) | jnp.any(behind & (palm | system.convex))
 
 
-def _null(rows):
-    """A unit vector orthogonal to four rows."""
-    return jnp.linalg.qr(rows.T, mode="complete")[0][:, 4]
+def _null(system, z):
+    """The unit tangent at `z`, of either sense: the longest column of the projector onto what is orthogonal to `G`."""
+    rows = constraint_rows(system.contacts, z)
+    projector = jnp.eye(5, dtype=z.dtype) - times(rows.T, solve(times(rows, rows.T), rows))
+    # The projector has half of the digits where rows are nearly dependent, which is enough for a hint.
+    return tangent(system, z, projector[jnp.argmax(jnp.diag(projector))])
 
 
 def _oriented(system, z, heading):
     """The unit tangent at `z` whose coordinate `heading.coordinate` has the sign asked for."""
-    null = _null(constraint_rows(system.contacts, z))
+    null = _null(system, z)
     return null * jnp.where(null[heading.coordinate] * heading.sign < 0, -1.0, 1.0)
 
 
@@ -190,13 +204,23 @@ def _oriented(system, z, heading):
 
 
 class _March(NamedTuple):
-    """Nodes along the wire: `n` of them, in charts numbered by `chart`; the last is where the end was bracketed."""
+    """Nodes along the wire: `n` of them, in charts numbered by `chart`; the last is where the end was bracketed.
+
+    `orientation` is `det [G; x]` at each; `flips` says what reverses or turns on the way to it from the node before
+    (`_speeds`, then the chart), at what `share` of that way. `speeds` are those of the last node, `sense` the signs
+    that they had last.
+    """
 
     n: Int[Array, ""]
     step: Float[Array, ""]
     z: Float[Array, "march 5"]
     x: Float[Array, "march 5"]
     s: Float[Array, "march"]
+    speeds: Float[Array, "6"]
+    sense: Float[Array, "6"]
+    flips: Bool[Array, "march 7"]
+    share: Float[Array, "march 7"]
+    orientation: Float[Array, "march"]
     chart: Int[Array, "march"]
     charts: Float[Array, "charts 5"]
     anchors: Float[Array, "charts 5"]
@@ -232,12 +256,18 @@ def _march(system, heading, z, x):
         return jnp.zeros((MAX_MARCH, *row.shape), row.dtype).at[0].set(row)
 
     values, rates, along = watch(z, x, x)
+    speeds = _speeds(system, z, x)
     begin = _March(
         n=jnp.asarray(1),
         step=jnp.asarray(LONGEST, z.dtype),
         z=buffer(z),
         x=buffer(x),
         s=jnp.full(MAX_MARCH, jnp.inf, z.dtype).at[0].set(0.0),
+        speeds=speeds,
+        sense=_signs_of(speeds, tolerance),
+        flips=buffer(jnp.zeros(7, bool)),
+        share=buffer(jnp.zeros(7, z.dtype)),
+        orientation=buffer(_oriented_tangent(system, z, x)[1]),
         chart=jnp.zeros(MAX_MARCH, int),
         charts=jnp.zeros((_CHARTS, 5), z.dtype).at[0].set(x),
         anchors=jnp.zeros((_CHARTS, 5), z.dtype).at[0].set(z),
@@ -254,8 +284,8 @@ def _march(system, heading, z, x):
 
     def step(m: _March) -> _March:
         z, x, u = m.z[m.n - 1], m.x[m.n - 1], m.charts[m.number]
-        z_new, moved = _correct(system, u, z + m.step * x / (u @ x), u @ z + m.step)
-        x_new = tangent(system, z_new, u)
+        z_new, moved, _ = _correct(system, u, z + m.step * x / (u @ x), u @ z + m.step)
+        x_new, orientation = _oriented_tangent(system, z_new, u)
         values, rates, along = watch(z_new, x_new, u)
         good = (moved < 1e-8) & (x_new @ x > 0.98) & jnp.all(jnp.isfinite(x_new))
         crossed, where = _crossings(system, m, values, rates, along, tolerance)
@@ -268,6 +298,10 @@ def _march(system, heading, z, x):
         number = m.number + turn
         chart_row = jnp.where(turn, number, _CHARTS)
         s_new = m.s[m.n - 1] + m.step
+        speeds = _speeds(system, z_new, x_new)
+        sign = _signs_of(speeds, tolerance)
+        flips = sign * m.sense < 0
+        share = jnp.where(flips, jnp.clip(m.speeds / jnp.where(flips, m.speeds - speeds, 1.0), 0.0, 1.0), 0.0)
         shorter = jnp.where(ends, jnp.maximum(m.step / 4, SHORTEST), m.step / 2)
         lost = ~good & (m.step < 1e-6)
         full = (m.n + 1 >= MAX_MARCH) | (number >= _CHARTS)
@@ -277,6 +311,11 @@ def _march(system, heading, z, x):
             z=m.z.at[row].set(z_new, mode="drop"),
             x=m.x.at[row].set(x_new, mode="drop"),
             s=m.s.at[row].set(s_new, mode="drop"),
+            speeds=jnp.where(accept, speeds, m.speeds),
+            sense=jnp.where(accept & (sign != 0), sign, m.sense),
+            flips=m.flips.at[row].set(jnp.append(flips, m.number != m.chart[m.n - 1]), mode="drop"),
+            share=m.share.at[row].set(jnp.append(share, 0.0), mode="drop"),
+            orientation=m.orientation.at[row].set(orientation, mode="drop"),
             chart=m.chart.at[row].set(m.number, mode="drop"),
             charts=m.charts.at[chart_row].set(x_new, mode="drop"),
             anchors=m.anchors.at[chart_row].set(z_new, mode="drop"),
@@ -294,18 +333,19 @@ def _march(system, heading, z, x):
     return jax.lax.while_loop(lambda m: ~m.done, step, begin)
 
 
-def _correct(system, u, z, height, steps=4):
-    """Newton in the chart: the point of the wire on the plane `u . z = height`, and the last step's size."""
+def _correct(system, u, z, height, steps=3):
+    """Newton in the chart: the point of the wire on the plane `u . z = height`, the last step's size and inverse."""
 
     def once(_, state):
-        z, _ = state
-        rows = jnp.concatenate([constraint_rows(system.contacts, z), u[None]])
+        z, *_ = state
+        inverted, _ = inverse(jnp.concatenate([constraint_rows(system.contacts, z), u[None]]))
         left = jnp.concatenate([constraints(system.contacts, z), (u @ z - height)[None]])
-        move = jnp.linalg.solve(rows, left)
-        return z - move, jnp.abs(move).max()
+        move = times(inverted, left)
+        return z - move, jnp.abs(move).max(), inverted
 
-    z, moved = jax.lax.fori_loop(0, steps, once, (z, jnp.asarray(jnp.inf, z.dtype)))
-    return z, jnp.where(jnp.isfinite(moved), moved, jnp.inf)
+    start = (z, jnp.asarray(jnp.inf, z.dtype), jnp.eye(5, dtype=z.dtype))
+    z, moved, inverted = jax.lax.fori_loop(0, steps, once, start)
+    return z, jnp.where(jnp.isfinite(moved), moved, jnp.inf), inverted
 
 
 def _crossings(system, m, values, rates, along, tolerance):
@@ -354,33 +394,22 @@ def _fifth(system, heading, march, z, hint, plane):
     room = [held.along - system.contacts.lower, system.contacts.upper - held.along]
     ahead = heading.until_value - z[heading.until_coordinate]
     others = jnp.concatenate([*room, ahead[None]])
-    ending = jnp.where(march.end < pairs, frame(made, z).gap, others[jnp.maximum(march.end - pairs, 0)])
+    ending = jnp.where(march.end < pairs, frames(made, z).gap, others[jnp.maximum(march.end - pairs, 0)])
     still = hint @ (z - plane)
-    return jnp.concatenate(
-        [slips(system.contacts, z, x), x[3:], still[None], jnp.where(march.end < 0, still, ending)[None]]
-    )
+    return jnp.concatenate([_speeds(system, z, x), jnp.stack([still, jnp.where(march.end < 0, still, ending)])])
 
 
 def _places(system, heading, march, resolution):
     """Sharpen the bracketed end and every sign change of slips and joint speeds to rounding level."""
     fixed = stop_gradient(system)
-    rows = jnp.arange(MAX_MARCH)
-    live = rows < march.n
-    reversing = jax.vmap(lambda z, x: jnp.concatenate([slips(fixed.contacts, z, x), x[3:]]))(march.z, march.x)
-    flips, share = _flips(reversing, live)
-    turns = live & (rows > 0) & (march.chart != jnp.roll(march.chart, 1))
-    found = jnp.concatenate([flips, turns[:, None]], axis=1)
-    share = jnp.concatenate([share, jnp.zeros((MAX_MARCH, 1), share.dtype)], axis=1)
-    before = jnp.roll(march.s, 1).at[0].set(0.0)
-    order = jnp.argsort(jnp.where(found, before[:, None] + share * SHORTEST, jnp.inf).ravel())[: resolution.pieces - 1]
     last = jnp.maximum(march.n - 1, 0)
-    used = jnp.append(found.ravel()[order], True)
-    segment = jnp.append(order // 7, last)
-    what = jnp.append(order % 7, _END)
-    fraction = share[segment, jnp.minimum(what, _PLANE)][:, None]
+    (found,) = jnp.nonzero(march.flips.ravel(), size=resolution.pieces - 1, fill_value=-1)
+    used = jnp.append(found >= 0, True)
+    segment = jnp.append(jnp.where(found >= 0, found // 7, 0), last)
+    what = jnp.append(jnp.where(found >= 0, found % 7, _PLANE), _END)
+    fraction = march.share[segment, jnp.minimum(what, _PLANE)][:, None]
     guess = march.z[segment - 1] * (1 - fraction) + march.z[segment] * fraction
     guess = jnp.where(used[:, None], guess, march.z[0]).at[-1].set(march.end_z)
-    what = jnp.where(used, what, _PLANE)
 
     # A chart ends at the node before the first step in the next one.
     chart = march.chart[jnp.maximum(segment - (what == _PLANE), 0)]
@@ -397,7 +426,8 @@ def _places(system, heading, march, resolution):
 
     z, residual, s = jax.vmap(locate)(segment, what, guess, chart)
     slack = jnp.where(what == _END, 4 * SHORTEST, 1e-6)
-    astray = (residual > 1e-8) | (s < before[segment] - slack) | (s > march.s[segment] + slack)
+    before = jnp.where(segment > 0, march.s[jnp.maximum(segment - 1, 0)], 0.0)
+    astray = (residual > 1e-8) | (s < before - slack) | (s > march.s[segment] + slack)
     failed = jnp.any(used & astray)
     kinks = jnp.where(used[:-1], s[:-1], jnp.inf)
     rank = jnp.argsort(stop_gradient(kinks))
@@ -406,33 +436,20 @@ def _places(system, heading, march, resolution):
 
 
 def _branches(system, march, end, astray):
-    """Whether the wire meets another one on its way: `det [G_n; x]`, the product of singular values, changes sign."""
-
-    def orientation(z, x):
-        return jnp.linalg.det(jnp.concatenate([constraint_rows(system.contacts, z), x[None]]))
-
+    """Whether the wire meets another one on its way: `det [G; x]` changes sign."""
     rows, last = jnp.arange(MAX_MARCH), jnp.maximum(march.n - 1, 0)
-    along = jax.vmap(orientation)(march.z, march.x)
     # The last node lies a little beyond the end: it counts only if the end was not found.
-    at_end = orientation(end, march.x[jnp.maximum(last - 1, 0)])
-    along = jnp.where((rows == last) & ~astray, at_end, along)
+    _, at_end = _oriented_tangent(system, end, march.x[jnp.maximum(last - 1, 0)])
+    along = jnp.where((rows == last) & ~astray, at_end, march.orientation)
     live = (rows < march.n) & (rows > 0) & (march.end >= 0)
     size = jnp.abs(jnp.where(live, along, along[0])).max()
     # Where two wires meet, Newton's method finds the end to half of the digits only.
     return jnp.any(live & (along * jnp.sign(along[0]) < jnp.finfo(end.dtype).eps ** 0.375 * size))
 
 
-def _flips(values, live):
-    """Sign changes of columns between rows `i - 1` and `i`, zeros taking the last sign seen; and their share of it."""
-    tolerance = jnp.finfo(values.dtype).eps ** 0.625
-    sign = jnp.where(jnp.abs(values) > tolerance, jnp.sign(values), 0.0)
-    rows = jnp.arange(values.shape[0])[:, None]
-    last = jax.lax.cummax(jnp.where(sign != 0, rows, -1), axis=0)
-    held = jnp.where(last >= 0, jnp.take_along_axis(sign, jnp.maximum(last, 0), axis=0), 0.0)
-    before, was = jnp.roll(held, 1, axis=0), jnp.roll(values, 1, axis=0)
-    flips = (held * before < 0) & live[:, None] & (rows > 0)
-    fall = jnp.where(flips, was - values, 1.0)
-    return flips, jnp.clip(jnp.where(flips, was / fall, 0.0), 0.0, 1.0)
+def _signs_of(values, tolerance):
+    """Signs, 0 for what is no larger than `tolerance`."""
+    return jnp.where(jnp.abs(values) > tolerance, jnp.sign(values), 0.0)
 
 
 # --- pieces, panels and nodes ----------------------------------------------------------------------------------------
@@ -476,13 +493,12 @@ def _cut(system, fixed, march, places, start, resolution):
 
     def node(s, guess, u, anchor, anchor_s):
         height = u @ anchor + s - anchor_s
-        z, moved = _correct(fixed, u, guess, stop_gradient(height), steps=3)
+        z, moved, inverted = _correct(fixed, u, guess, stop_gradient(height))
 
         def equations(z, system, height):
             return jnp.concatenate([constraints(system.contacts, z), (u @ z - height)[None]])
 
-        rows = jnp.concatenate([constraint_rows(fixed.contacts, stop_gradient(z)), u[None]])
-        return z - jnp.linalg.solve(stop_gradient(rows), equations(stop_gradient(z), system, height)), moved
+        return z - times(stop_gradient(inverted), equations(stop_gradient(z), system, height)), moved
 
     per_panel = jax.vmap(node, (0, 0, None, None, None))
     nodes, moved = jax.vmap(per_panel)(s, guess, chart[owner], anchor[owner], anchor_s[owner])
@@ -548,12 +564,11 @@ def _signs(system, nodes, chart, owner, resolution):
     """Signs of slips and joint speeds of each piece, and whether any node contradicts its piece's sign."""
 
     def speeds(z, u):
-        x = tangent(system, z, u)
-        return jnp.concatenate([slips(system.contacts, z, x), x[3:]])
+        return _speeds(system, z, tangent(system, z, u))
 
     values = jax.vmap(jax.vmap(speeds, (0, None)))(nodes, chart[owner])
     total = jax.ops.segment_sum(values.sum(1), owner, resolution.pieces)
     tolerance = jnp.finfo(nodes.dtype).eps ** 0.625
-    signs = jnp.where(jnp.abs(total) > tolerance, jnp.sign(total), 0.0)
+    signs = _signs_of(total, tolerance)
     missed = jnp.any(values * signs[owner][:, None] < -tolerance) | ~jnp.all(jnp.isfinite(values))
     return signs[:, :4], signs[:, 4:], missed

@@ -1,0 +1,62 @@
+r"""Eliminate: inverses and determinants of the small square matrices that every place of a wire needs.
+
+Gauss-Jordan elimination with row pivoting, as plain array operations, which a batch runs side by side. LAPACK's batched
+routines, as JAX calls them on processors, wait inside the pool of threads that they run on: on two processors a program
+with two of them may wait for ever (seen with jaxlib 0.10.2).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+@jax.jit
+def inverse(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
+    """`A^-1` and `det A`. Of a singular matrix the first is not finite and the second 0.
+
+    Derivatives: `d(A^-1) = -A^-1 dA A^-1` and `d(det A) = det A tr(A^-1 dA)`.
+    """
+    return _eliminated(matrix)
+
+
+@jax.custom_jvp
+def _eliminated(matrix):
+    n = matrix.shape[0]
+    rows = jnp.arange(n)
+
+    def clear(k, state):
+        """Make column `k` that of the identity."""
+        wide, determinant = state
+        candidates = jnp.where(rows >= k, jnp.abs(wide[:, k]), -1.0)
+        p = jnp.argmax(candidates)
+        top, pivot = wide[k], wide[p]
+        grown = determinant * pivot[k] * jnp.where(p == k, 1.0, -1.0)
+        determinant = jnp.where(determinant == 0, 0.0, grown)  # what follows a pivot of 0 is not a number
+        pivot = pivot / pivot[k]
+        wide = jnp.where((rows == p)[:, None], top, wide)
+        wide = jnp.where((rows == k)[:, None], pivot, wide - wide[:, k][:, None] * pivot)
+        return wide, determinant
+
+    wide = jnp.concatenate([matrix, jnp.eye(n, dtype=matrix.dtype)], axis=1)
+    wide, determinant = jax.lax.fori_loop(0, n, clear, (wide, jnp.ones((), matrix.dtype)))
+    return wide[:, n:], determinant
+
+
+@_eliminated.defjvp
+def _rate(primals, tangents):
+    (matrix,), (rate,) = primals, tangents
+    inverted, determinant = _eliminated(matrix)
+    relative = times(inverted, rate)
+    return (inverted, determinant), (-times(relative, inverted), determinant * jnp.trace(relative))
+
+
+def times(matrix: Float[Array, "m n"], right: Float[Array, "n *columns"]) -> Float[Array, "m *columns"]:
+    """The product with a vector or matrix as a sum of products: small batched ones are slow as calls of a library."""
+    if right.ndim == 1:
+        return (matrix * right).sum(1)
+    return (matrix[:, :, None] * right).sum(1)
+
+
+def solve(matrix: Float[Array, "n n"], right: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
+    """`A^-1 b`."""
+    return times(inverse(matrix)[0], right)
