@@ -1,5 +1,6 @@
 """Notebooks: each runs from its question to its figure without a complaint, and its kept outputs are small."""
 
+import os
 import re
 from pathlib import Path
 
@@ -10,6 +11,18 @@ import pytest
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 LARGEST = 500_000  # bytes of a notebook with its outputs
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled(tmp_path_factory):
+    """Kernels share compiled programs, of all workers, unless the environment says where they are kept already."""
+    with pytest.MonkeyPatch.context() as patch:
+        if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+            base = tmp_path_factory.getbasetemp()
+            shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "compiled"
+            patch.setenv("JAX_COMPILATION_CACHE_DIR", str(shared))
+            patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+        yield
 
 
 def pictures(cell) -> int:

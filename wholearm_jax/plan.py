@@ -247,7 +247,7 @@ def margin(
 
     >>> scene = wa.load("heptagon")
     >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")
-    0.77 N
+    0.70 N
     """
     found = outcomes(scene, torque, trace(scene, resolution=resolution), how)
     return jnp.stack([jnp.where(jnp.isfinite(o.score.margin), o.score.margin, -jnp.inf) for o in found]).min()
