@@ -24,7 +24,6 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import measure
 import numpy as np
-from tolerances import AnyTolerance, any_tolerance
 
 import wholearm_jax as wa
 from wholearm_jax.forces import score
@@ -51,7 +50,7 @@ def given(phase: int, knots: int) -> Torque:
     return Torque(jnp.asarray(share[:, 0]), jnp.asarray(values[rows[0]] * (1 - share) + values[rows[1]] * share))
 
 
-def margin(values, times, table, duration, how: AnyTolerance):
+def margin(values, times, table, duration, how: wa.Integration):
     """The margin of one phase."""
     seen = window(padded(Torque(times, values)), jnp.zeros(()), duration)
     return score(table, seen, duration, move(table, seen, duration, how=how), how).margin
@@ -62,7 +61,9 @@ def programs(times, values, table) -> dict[str, tuple]:
     duration = jnp.ones(())
 
     def function(adjoint):
-        return lambda v, tolerance: margin(v, times, table, duration, any_tolerance(tolerance, adjoint=adjoint))
+        return lambda v, tolerance: margin(
+            v, times, table, duration, wa.Integration(tolerance=tolerance, adjoint=adjoint)
+        )
 
     def forward(v, tolerance):
         value = function("forward")

@@ -37,7 +37,6 @@ import measure
 import newton_in_field
 import numba_loop
 import numpy as np
-from tolerances import AnyTolerance, any_tolerance
 
 import wholearm_jax as wa
 from wholearm_jax import plan, scene_file
@@ -160,7 +159,7 @@ def error(problem: Problem, shares, z, z_dot, cn) -> float:
 
 
 @eqx.filter_jit
-def _move(table: Table, seen: Window, duration, how: AnyTolerance) -> Motion:
+def _move(table: Table, seen: Window, duration, how: wa.Integration) -> Motion:
     return move(table, seen, duration, how=how)
 
 
@@ -176,7 +175,7 @@ def package(problem: Problem, solver: str, tolerance: float):
     table = problem.traced.table
     limit = 256
     while True:
-        how = any_tolerance(tolerance, solver=SOLVERS[solver], max_steps=limit)
+        how = wa.Integration(tolerance=jnp.asarray(tolerance), solver=SOLVERS[solver], max_steps=limit)
         motion = _move(table, problem.seen, problem.duration, how)
         if int(motion.status) != Status.MAX_STEPS or limit >= 16384:
             break
@@ -202,7 +201,8 @@ def package(problem: Problem, solver: str, tolerance: float):
 
 def between(problem: Problem, tolerance: float) -> dict[str, float]:
     """The error of the sampled trajectory between the steps of the default solver."""
-    motion = _move(problem.traced.table, problem.seen, problem.duration, any_tolerance(tolerance))
+    how = wa.Integration(tolerance=jnp.asarray(tolerance))
+    motion = _move(problem.traced.table, problem.seen, problem.duration, how)
     # Beyond the wire's end, which a coarse run reaches a little early, the object rests.
     last = min(problem.stop, float(motion.share[int(motion.count)]))
     shares = jnp.linspace(0.0, last * (1 - 1e-12), 401)

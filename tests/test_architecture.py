@@ -23,7 +23,7 @@ ORDER = (
         "motion",
         "forces",
     ),
-    *("verdict", "plan", "squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
+    *("verdict", "plan", "gradient_check", "squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
     *("free_bodies", "execution", "perturbation"),
     *("writing", "scene_file", "result_file", "palette", "report", "drawing", "__init__", "command"),
 )

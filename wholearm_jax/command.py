@@ -130,6 +130,9 @@ def simulate(
     set_: Changes = None,
     samples: Samples = 201,
     tolerance: Annotated[float, typer.Option(min=1e-13, max=1e-3, help="The integrator's tolerance.")] = 1e-10,
+    check_gradient: Annotated[
+        bool, typer.Option("--check-gradient", help="Also the margin's derivatives: both modes against differences.")
+    ] = False,
 ) -> None:
     """Simulate a plan under a given torque schedule."""
     loaded = _scene(scene, set_)
@@ -142,8 +145,31 @@ def simulate(
     result = _predicted(loaded, schedule, torque, tolerance, traced)
     for phase in result.phases:
         print(phase.message)
+    if check_gradient:
+        _check_gradient(loaded, schedule)
     tops = tuple(float(b.value) for b in bounds(loaded, traced=traced))
     _finish(result, folder, samples, bounds=tops, command="simulate", torque=str(torque), tolerance=tolerance)
+
+
+def _check_gradient(scene, schedule) -> None:
+    """Print the margin's slopes, each three ways."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from wholearm_jax.gradient_check import check_gradient
+
+    try:
+        slopes = check_gradient(scene, schedule)
+    except ValueError as error:
+        print(f"gradient: {error}")
+        return
+    table = Table(title="slope of the margin [N] along a random relative change of the inputs")
+    for column in ("inputs", "tolerance", "forward mode", "reverse mode", "differences", "give or take", ""):
+        table.add_column(column, justify="left" if column == "inputs" else "right", no_wrap=True)
+    for one in slopes:
+        numbers = (f"{x:.10g}" for x in (one.forward, one.reverse, one.differences))
+        table.add_row(one.group, f"{one.tolerance:.0e}", *numbers, f"{one.uncertainty:.0e}", one.finding)
+    Console(width=120).print(table)
 
 
 @app.command()

@@ -45,11 +45,12 @@ class Integration(eqx.Module):
     `steps` says that the torque schedule has steps inside the phase. `adjoint` says what the solve will be
     differentiated by: `"none"`, `"forward"`, `"reverse"` or `"both"`. Where reverse mode is wanted, the steps are found
     once by the adaptive controller and taken again as they are: differentiating saved steps through rejected ones in
-    reverse mode gives wrong derivatives (seen with diffrax 0.7.2), and the repetition has none. All of it is static.
+    reverse mode gives wrong derivatives (seen with diffrax 0.7.2), and the repetition has none. All but a `tolerance`
+    that is an array is static: each choice is a program of its own.
     """
 
     solver: dfx.AbstractSolver = eqx.field(static=True, default=dfx.Dopri8())
-    tolerance: float = eqx.field(static=True, default=1e-10)
+    tolerance: float | Float[Array, ""] = 1e-10
     max_steps: int = eqx.field(static=True, default=256)
     stages: int = eqx.field(static=True, default=8)
     steps: bool = eqx.field(static=True, default=False)
