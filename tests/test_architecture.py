@@ -25,7 +25,7 @@ ORDER = (
     ),
     *("verdict", "plan", "gradient_check", "squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
     *("free_bodies", "execution", "perturbation"),
-    *("writing", "scene_file", "result_file", "drawing", "__init__", "command"),
+    *("writing", "scene_file", "result_file", "palette", "report", "drawing", "__init__", "command"),
 )
 
 
