@@ -1,4 +1,4 @@
-"""The command line: `wholearm optimise`, `simulate`, `search`, `report`, `formations`, `execute`, `scenes`.
+"""The command line: `wholearm optimise`, `simulate`, `search`, `check`, `report`, `formations`, `execute`, `scenes`.
 
 Exit status 0 when the result is `ok`, 1 when the plan fails (its status is printed), 2 for bad input, in one line.
 """
@@ -13,20 +13,20 @@ from typing import Annotated
 import jax
 import typer
 
+from wholearm_jax.arguments import BadInput, SceneName, TorqueFile
+from wholearm_jax.batch_command import ARRIVAL, check, ensemble, optimise_robustly
+
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
-SceneName = Annotated[str, typer.Argument(help="A bundled scene's name, or the path of a scene file.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for torque.csv, trajectory.csv, summary.json and figures.")]
 Changes = Annotated[
     list[str] | None,
     typer.Option("--set", help="PHASE.duration=SECONDS; PHASE is a name or a number from 0. May be repeated."),
 ]
-TorqueFile = Annotated[Path, typer.Option("--torque", help="Torque schedule, CSV with the header t,tau1,tau2.")]
 Samples = Annotated[int, typer.Option(min=2, help="Rows a phase in trajectory.csv.")]
 
 
-class _BadInput(Exception):
-    """What the user gave cannot be used; the message is one line."""
+app.command()(check)
 
 
 def main() -> None:
@@ -41,7 +41,7 @@ def main() -> None:
 
     try:
         app()
-    except (SceneError, _BadInput) as error:
+    except (SceneError, BadInput) as error:
         print(f"wholearm: {error}", file=sys.stderr)
         sys.exit(2)
 
@@ -83,14 +83,26 @@ def optimise(
     knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase.")] = 51,
     steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 120,
     rate_limit: Annotated[float | None, typer.Option(min=0.0, help="Largest torque rate [N m/s].")] = None,
-    samples: Samples = 201,
+    samples: Annotated[
+        int | None, typer.Option(min=2, help="Rows a phase in trajectory.csv (201), or samples.")
+    ] = None,
+    robust: Annotated[
+        list[str] | None, typer.Option(help="QUANTITY=AMOUNT: the best torques for --samples (64) varied scenes.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the varied scenes.")] = 0,
+    arrival: Annotated[float, typer.Option(min=1e-9, max=1.0, help="As of `check`, for --robust.")] = ARRIVAL,
     report: Annotated[bool, typer.Option("--report", help="Also report.html, one page with an animation.")] = False,
 ) -> None:
     """Find the torques with the largest compressive margin, and check them by simulation."""
     if report and out is None:
-        raise _BadInput("--report: needs a folder to write to: add --out DIR")
+        raise BadInput("--report: needs a folder to write to: add --out DIR")
     loaded = _scene(scene, set_)
     folder = _folder(out)
+    if robust:
+        if rate_limit is not None:
+            raise BadInput("--robust: knows no --rate-limit")
+        optimise_robustly(ensemble(loaded, robust, seed), folder, samples or 64, knots, steps, arrival)
+    samples = samples or 201
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -196,7 +208,7 @@ def formations(
         row = _phase_number(loaded, after)
         if row is None:
             names = ", ".join(p.name for p in loaded.phases)
-            raise _BadInput(f"--after {after}: no such phase; phases: {names}")
+            raise BadInput(f"--after {after}: no such phase; phases: {names}")
         z, z_dot = end_configuration(traced[row]), leaving(traced[row].table)
     found = ways(loaded, z, z_dot)
     table = Table(title=f"touching: {', '.join(touching(loaded, z))}")
@@ -238,7 +250,7 @@ def report(
     try:
         _write_report(folder, path)
     except OSError as error:
-        raise _BadInput(f"{path}: cannot be written: {error.strerror}") from None
+        raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
     print(path)
 
 
@@ -260,7 +272,7 @@ def execute(
 ) -> None:
     """Execute a torque schedule open loop on free bodies with soft contacts, in MuJoCo."""
     if video and out is None:
-        raise _BadInput("--video: needs a folder to write to: add --out DIR")
+        raise BadInput("--video: needs a folder to write to: add --out DIR")
     shares = _share("--friction", friction), _share("--mass", mass)
     loaded = _scene(scene, None)
     try:
@@ -271,7 +283,7 @@ def execute(
     except ModuleNotFoundError as error:
         if error.name != "mujoco":
             raise
-        raise _BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
+        raise BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
     from wholearm_jax.result_file import read_torque
 
     schedule = read_torque(torque)
@@ -304,7 +316,7 @@ def _share(option: str, text: str) -> float:
     except ValueError:
         share = -1.0
     if not 0 <= share < 1:
-        raise _BadInput(f"{option} {text}: write a share between 0 and 1, e.g. 10% or 0.1")
+        raise BadInput(f"{option} {text}: write a share between 0 and 1, e.g. 10% or 0.1")
     return share
 
 
@@ -315,7 +327,7 @@ def _predicted(scene, schedule, torque: Path, tolerance: float, traced):
     try:
         return follow(scene, schedule, tolerance=tolerance, traced=traced)
     except ValueError as error:
-        raise _BadInput(f"{torque}: {error}") from None
+        raise BadInput(f"{torque}: {error}") from None
 
 
 def _scene(name: str, changes: list[str] | None):
@@ -361,8 +373,8 @@ def _traced(name: str, scene):
             which = phase.formation.names[phase.formation.contact_of_slot[worst]]
             key, size = f"phase[{k}].contacts", float(gap[worst] * length)
             if phase.formation.tangential[worst]:
-                raise _BadInput(f"{name}: {key}: {which} cannot stay in its place {where}: it is off by {size:.3g} m")
-            raise _BadInput(f"{name}: {key}: {which} cannot touch {where}: a gap of {size:.3g} m stays open")
+                raise BadInput(f"{name}: {key}: {which} cannot stay in its place {where}: it is off by {size:.3g} m")
+            raise BadInput(f"{name}: {key}: {which} cannot touch {where}: a gap of {size:.3g} m stays open")
         break  # what follows a wire that cannot be followed has no start
     return traced
 
@@ -377,13 +389,13 @@ def _changed(scene, change: str):
     names = [p.name for p in scene.phases]
     row = _phase_number(scene, phase)
     if field != "duration" or row is None:
-        raise _BadInput(f"--set {change}: write PHASE.duration=SECONDS; phases: {', '.join(names)}")
+        raise BadInput(f"--set {change}: write PHASE.duration=SECONDS; phases: {', '.join(names)}")
     try:
         seconds = float(value)
     except ValueError:
         seconds = float("nan")
     if not 0 < seconds < float("inf"):
-        raise _BadInput(f"--set {change}: a duration is a positive number of seconds")
+        raise BadInput(f"--set {change}: a duration is a positive number of seconds")
     phases = tuple(replace_duration(p, seconds) if k == row else p for k, p in enumerate(scene.phases))
     return eqx.tree_at(lambda s: s.phases, scene, phases)
 
@@ -405,7 +417,7 @@ def _folder(out: Path | None) -> Path | None:
         probe.write_text("")
         probe.unlink()
     except OSError as error:
-        raise _BadInput(f"--out {out}: cannot be written: {error.strerror}") from None
+        raise BadInput(f"--out {out}: cannot be written: {error.strerror}") from None
     return out
 
 
@@ -422,7 +434,7 @@ def _finish(result, folder: Path | None, samples: int, report: bool = False, **m
             if report:
                 _write_report(folder, folder / "report.html")
         except OSError as error:
-            raise _BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
+            raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
     print(result.message if not folder else f"{result.message} -> {folder}")
     sys.exit(0 if result.status.value == 0 else 1)
 
@@ -445,7 +457,7 @@ def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> Non
         write_whole(folder / "model.xml", done.model_xml)
         _draw_execution(done, folder, video)
     except OSError as error:
-        raise _BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
+        raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
 
 
 def _draw_execution(done, folder: Path, video: bool) -> None:

@@ -6,6 +6,7 @@ matplotlib alone. Sizes of text and lines come from matplotlib's settings; `PAPE
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import matplotlib.pyplot as plt
@@ -19,6 +20,7 @@ from wholearm_jax.palette import CONTACT_COLOURS, DASHES, contact_styles
 from wholearm_jax.palette import LINK_COLOURS as COLOURS
 from wholearm_jax.plan import Result, trajectory
 from wholearm_jax.scene import Scene, body, parse_contact
+from wholearm_jax.survey import Survey
 
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
     from wholearm_jax.execution import Execution
@@ -385,3 +387,26 @@ def _legend(ax: Axes, columns: int) -> Axes:
 def _legend_beside(ax: Axes) -> Axes:
     ax.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return ax
+
+
+def draw_survey(told: Survey, parameters: Sequence[tuple[str, np.ndarray]] = ()) -> list[Axes]:
+    """A histogram of the sampled margins and, over the two `parameters` (name, shares of their amounts), a map."""
+    finite = np.isfinite(told.margins)
+    margins = told.margins[finite]
+    figure, axes = plt.subplots(1, 1 + (len(parameters) == 2), figsize=(7.2, 2.9), layout="constrained", squeeze=False)
+    left = axes[0, 0]
+    left.hist(margins, bins=60, color=COLOURS[0])
+    left.axvline(0.0, color=_INK, lw=0.8)
+    low, high = (100 * end for end in told.interval)
+    left.set(xlabel="margin [N]", ylabel="scenes", title=f"{low:.1f} to {high:.1f} % hold")
+    if len(parameters) == 2:
+        (across, x), (up, y) = parameters
+        right = axes[0, 1]
+        edges = np.linspace(-1.0, 1.0, int(np.clip(np.sqrt(len(margins) / 8), 2, 40)) + 1)
+        number, *_ = np.histogram2d(y[finite], x[finite], bins=(edges, edges))
+        total, *_ = np.histogram2d(y[finite], x[finite], bins=(edges, edges), weights=margins)
+        mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+        image = right.pcolormesh(edges, edges, mean, cmap="viridis")
+        right.set(xlabel=f"{across} (share of its amount)", ylabel=up)
+        figure.colorbar(image, ax=right, label="mean margin [N]")
+    return list(axes[0])

@@ -22,7 +22,7 @@ from wholearm_jax.scene import Phase, Scene, body, contact_name
 from wholearm_jax.schedule import Torque, has_steps, padded, window
 from wholearm_jax.status import Status
 from wholearm_jax.system import system
-from wholearm_jax.verdict import Verdict, judge
+from wholearm_jax.verdict import ARRIVAL, Verdict, judge
 from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
 
 SLIPPING = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
@@ -118,24 +118,27 @@ def prepare(scene_body, hand, gravity, formation, rough, heading, resolution: Re
     return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), Traced(wire, reduce_wire(mechanics, wire)))
 
 
-def run(table: Table, schedule: Torque, start, duration, how: Integration, at_rest, arriving=None) -> Outcome:
+def run(
+    table: Table, schedule: Torque, start, duration, how: Integration, at_rest, arriving=None, arrival=ARRIVAL
+) -> Outcome:
     """Simulate one phase from its wire's start, score it and judge it: it must end at rest if `at_rest`.
 
-    `arriving` is `z_dot` (SI) at the end of the phase before, for a change of formation while moving (None: at rest).
+    `arriving` is `z_dot` (SI) at the end of the phase before, for a change of formation while moving (None: at rest);
+    `arrival` how near the wire's end the phase must come (`verdict`).
     """
     dtype = table.breaks.dtype
     arriving = jnp.asarray(np.zeros(5), dtype) if arriving is None else arriving
-    start, duration, at_rest = jnp.asarray(start, dtype), jnp.asarray(duration, dtype), jnp.asarray(at_rest)
-    return _run(table, schedule, start, duration, arriving, how, at_rest)
+    start, duration, arrival = (jnp.asarray(a, dtype) for a in (start, duration, arrival))
+    return _run(table, schedule, start, duration, arriving, how, jnp.asarray(at_rest), arrival)
 
 
 @eqx.filter_jit
-def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, at_rest) -> Outcome:
+def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, at_rest, arrival) -> Outcome:
     seen = window(schedule, start, duration)
     entered = change(table, arriving)
     motion = move(table, seen, duration, how=how, speed=jnp.maximum(entered.speed, 0.0))
     scored = score(table, seen, duration, motion, how)
-    verdict = judge(table, motion, scored, at_rest, entered)
+    verdict = judge(table, motion, scored, at_rest, entered, arrival)
     last = jnp.maximum(motion.count - 1, 0)
     panel, xi = powers(table, motion.piece[last], motion.s[motion.count])
     leaving = horner(table.velocity[panel], xi) * motion.w[motion.count] / duration
@@ -171,13 +174,13 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     solid, rough, found = body(scene.object), scene.start, []
     for phase in scene.phases:
         traced = _refined(solid, scene, phase, rough, resolution, tolerance)
-        found.append(_joined(traced, rough) if found else traced)
+        found.append(joined(traced, rough) if found else traced)
         rough = end_configuration(traced)
     return tuple(found)
 
 
 @jax.jit
-def _joined(traced: Traced, rough) -> Traced:
+def joined(traced: Traced, rough) -> Traced:
     """Refuse a phase whose formation does not hold where the phase before it ended."""
     panel, xi = powers(traced.table, jnp.asarray(0), traced.table.breaks[0])
     apart = jnp.abs(horner(traced.table.configuration[panel], xi) - rough).max()
@@ -213,14 +216,16 @@ def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, toleranc
             return traced
 
 
-def outcomes(scene: Scene, torque: Torque, traced: tuple[Traced, ...], how: Integration) -> tuple[Outcome, ...]:
+def outcomes(
+    scene: Scene, torque: Torque, traced: tuple[Traced, ...], how: Integration, arrival: float = ARRIVAL
+) -> tuple[Outcome, ...]:
     """Simulate every phase; differentiable, and usable under any JAX transformation."""
     zero = jnp.zeros((), torque.times.dtype)
     schedule, start, planned, still, found = _padded(torque), zero, zero, jnp.zeros(5, zero.dtype), []
     arriving = still
     for phase, at in zip(scene.phases, traced, strict=True):
         planned = planned + phase.duration
-        one = run(at.table, schedule, start, planned - start, how, phase.arrive == "rest", arriving)
+        one = run(at.table, schedule, start, planned - start, how, phase.arrive == "rest", arriving, arrival)
         found.append(one)
         flying = phase.arrive == "moving"
         start = start + one.duration * one.motion.share[one.motion.count] if flying else planned
@@ -253,13 +258,28 @@ def margin(
     return jnp.stack([jnp.where(jnp.isfinite(o.score.margin), o.score.margin, -jnp.inf) for o in found]).min()
 
 
+def require_covered(scenes: Scene, torque: Torque) -> None:
+    """Raise ValueError for a schedule that is shorter than the plan, or than the longest plan of stacked scenes."""
+    total = float(np.max(sum(np.asarray(p.duration) for p in scenes.phases)))
+    first, last = float(torque.times[0]), float(torque.times[-1])
+    if first > 0 or last < total * (1 - 1e-9):
+        raise ValueError(f"the torque schedule covers {first:g} to {last:g} s, the plan 0 to {total:g} s")
+
+
 def simulate(
-    scene: Scene, torque: Torque, *, tolerance: float = 1e-10, max_steps: int = 256, traced: tuple[Traced, ...] = ()
+    scene: Scene,
+    torque: Torque,
+    *,
+    tolerance: float = 1e-10,
+    max_steps: int = 256,
+    traced: tuple[Traced, ...] = (),
+    arrival: float = ARRIVAL,
 ) -> Result:
     """Simulate a plan under a torque schedule and judge it.
 
-    `tolerance` is the integrator's; `traced` reuses the result of `trace`. Raises ValueError for a schedule that is
-    shorter than the plan; everything else is a status.
+    `tolerance` is the integrator's; `traced` reuses the result of `trace`; `arrival` is how near its wire's end a phase
+    must come, as a share of the wire's length. Raises ValueError for a schedule that is shorter than the plan;
+    everything else is a status.
 
     Integrates the paper's eq. (16) (derivation, section 6). Raises RuntimeError without float64.
 
@@ -271,17 +291,12 @@ def simulate(
     slide left: stuck, t = 1 s: friction holds the object at rest; raise the torque that pushes it, or lower the squeeze
     """
     require_x64()
-    total = sum(float(p.duration) for p in scene.phases)
-    last = float(torque.times[-1])
-    if float(torque.times[0]) > 0 or last < total * (1 - 1e-9):
-        raise ValueError(
-            f"the torque schedule covers {float(torque.times[0]):g} to {last:g} s, the plan 0 to {total:g} s"
-        )
+    require_covered(scene, torque)
     traced = traced or trace(scene)
     stepped = any(has_steps(torque, start, end) for start, end in _spans(scene))
     while True:
         how = Integration(tolerance=tolerance, max_steps=max_steps, stages=max(8, max_steps // 32), steps=stepped)
-        found = outcomes(scene, torque, traced, how)
+        found = outcomes(scene, torque, traced, how, arrival)
         short = any(int(o.verdict.status) == Status.MAX_STEPS for o in found)
         if not short or max_steps >= 16384:
             return describe(scene, torque, traced, found)

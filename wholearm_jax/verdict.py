@@ -1,7 +1,5 @@
 """Judge: what became of a simulated phase, from its motion and its score."""
 
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -12,10 +10,10 @@ from wholearm_jax.reduction import Change, Table
 from wholearm_jax.status import Status
 
 ARRIVAL = 1e-6  # of the wire's length: how near its end a phase that arrives at rest must come
-ARRIVAL_SPEED = math.sqrt(12 * ARRIVAL)
-"""Speed left at arrival, in wire lengths a duration: what braking at 6 lengths a duration squared (the even
-rest-to-rest motion) ends within `ARRIVAL` of a length. Nearer to the end time and position do not fix the speed better
-than this square root."""
+BRAKING = 12.0
+"""The speed left at arrival within a share `a` of the wire is at most `sqrt(BRAKING a)` wire lengths a duration: what
+braking at 6 lengths a duration squared (the even rest-to-rest motion) ends within `a` of a length. Nearer to the end
+time and position do not fix the speed better than this square root."""
 
 PULL = 1e-9  # share of `Change.size` by which an impulse may be negative for rounding
 
@@ -28,16 +26,25 @@ class Verdict(eqx.Module):
     contact: Int[Array, ""]
 
 
-def judge(table: Table, motion: Motion, score: Score, at_rest: Bool[Array, ""], entered: Change) -> Verdict:
-    """Decide the status of a phase that must end at rest (`at_rest`) or may end moving.
+def judge(
+    table: Table,
+    motion: Motion,
+    score: Score,
+    at_rest: Bool[Array, ""],
+    entered: Change,
+    arrival: float | Float[Array, ""] = ARRIVAL,
+) -> Verdict:
+    """Decide the status of a phase that must end at rest (`at_rest`) or may end moving, within a share `arrival` of
+    its wire's length.
 
     The earliest trouble counts: a wire that cannot be traced, an impulse that would pull (or throw the object back)
     where the phase is entered with speed, a tensile force, then how the motion ended.
     """
     share, s, w = (values[motion.count] for values in (motion.share, motion.s, motion.w))
-    near = jnp.abs(table.breaks[-1] - s) <= ARRIVAL * table.length
-    slow = w <= ARRIVAL_SPEED * table.length
-    late = share >= 1 - ARRIVAL_SPEED
+    speed = jnp.sqrt(BRAKING * jnp.asarray(arrival, s.dtype))
+    near = jnp.abs(table.breaks[-1] - s) <= arrival * table.length
+    slow = w <= speed * table.length
+    late = share >= 1 - speed
     ended = motion.status
     there = (ended == Status.LEFT_FORMATION) | (ended == Status.OK)
     held = (ended == Status.STUCK) | ((ended == Status.REVERSED) & late)
