@@ -15,7 +15,7 @@ ORDER = (
     *("squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),
     *("free_bodies", "execution", "perturbation"),
-    *("writing", "scene_file", "result_file", "store", "polygon_file", "drawing", "__init__"),
+    *("writing", "scene_file", "result_file", "store", "polygon_file", "palette", "report", "drawing", "__init__"),
     *("arguments", "batch_command", "command"),
 )
 

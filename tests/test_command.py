@@ -77,7 +77,7 @@ def test_scenes(wholearm):
 def test_help_lists_the_commands(wholearm):
     code, out, _ = wholearm("--help")
     assert code == 0
-    for name in ("optimise", "simulate", "search", "formations", "execute", "scenes"):
+    for name in ("optimise", "simulate", "search", "report", "formations", "execute", "scenes"):
         assert f"  {name} " in out
 
 

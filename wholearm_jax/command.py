@@ -1,4 +1,4 @@
-"""The command line: `wholearm optimise`, `simulate`, `search`, `formations`, `execute`, `check`, `scenes`.
+"""The command line: `wholearm optimise`, `simulate`, `search`, `check`, `report`, `formations`, `execute`, `scenes`.
 
 Exit status 0 when the result is `ok`, 1 when the plan fails (its status is printed), 2 for bad input, in one line.
 """
@@ -6,6 +6,7 @@ Exit status 0 when the result is `ok`, 1 when the plan fails (its status is prin
 import os
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -90,8 +91,11 @@ def optimise(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the varied scenes.")] = 0,
     arrival: Annotated[float, typer.Option(min=1e-9, max=1.0, help="As of `check`, for --robust.")] = ARRIVAL,
+    report: Annotated[bool, typer.Option("--report", help="Also report.html, one page with an animation.")] = False,
 ) -> None:
     """Find the torques with the largest compressive margin, and check them by simulation."""
+    if report and out is None:
+        raise BadInput("--report: needs a folder to write to: add --out DIR")
     loaded = _scene(scene, set_)
     folder = _folder(out)
     if robust:
@@ -126,7 +130,8 @@ def optimise(
         print(f"{phase.message}; bound {float(top.value):.4g} N{reached}; stopped: {why}")
     more = {"command": "optimise", "knots": knots, "steps": len(found.history), "seconds": seconds}
     more |= {"rate_limit": rate_limit, "stopped": list(found.stopped)}
-    _finish(found.result, folder, samples, bounds=tuple(float(b.value) for b in found.bounds), **more)
+    tops = tuple(float(b.value) for b in found.bounds)
+    _finish(found.result, folder, samples, report=report, bounds=tops, **more)
 
 
 @app.command()
@@ -183,7 +188,9 @@ def _check_gradient(scene, schedule) -> None:
 def formations(
     scene: SceneName,
     after: Annotated[str | None, typer.Option(help="A phase, by name or number: list what can follow its end.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for a picture of all ways, formations.svg and .png.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for a picture of all ways: formations.png, .svg, .pdf.")
+    ] = None,
 ) -> None:
     """List the formations of four contacts that hold at a configuration, and where their wires lead."""
     loaded = _scene(scene, None)
@@ -215,7 +222,7 @@ def formations(
     if folder is not None:
         from wholearm_jax.drawing import draw_ways
 
-        _save_figure(draw_ways(loaded, z, found), folder, "formations")
+        _save_figure(lambda: draw_ways(loaded, z, found), folder, "formations")
 
 
 @app.command()
@@ -234,10 +241,24 @@ def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
 
 
 @app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A folder that optimise, simulate or search wrote.")],
+    out: Annotated[Path | None, typer.Option(help="The page to write; report.html in the folder unless given.")] = None,
+) -> None:
+    """Write a result folder's report: one page with an animation, plots and tables, for any browser, offline."""
+    path = out or folder / "report.html"
+    try:
+        _write_report(folder, path)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
+    print(path)
+
+
+@app.command()
 def execute(
     scene: SceneName,
     torque: TorqueFile,
-    out: Annotated[Path | None, typer.Option(help="Folder for execution.json, .csv, .png, .svg, model.xml.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for execution.json, .csv, figures and model.xml.")] = None,
     timestep: Annotated[float, typer.Option(min=1e-6, max=1e-2, help="Time step [s].")] = 2e-4,
     position: Annotated[float, typer.Option(min=0.0, help="Success: this near the predicted end [m].")] = 5e-4,
     angle: Annotated[float, typer.Option(min=0.0, help="Success: this near the predicted angle [rad].")] = 0.01,
@@ -400,7 +421,7 @@ def _folder(out: Path | None) -> Path | None:
     return out
 
 
-def _finish(result, folder: Path | None, samples: int, **more) -> None:
+def _finish(result, folder: Path | None, samples: int, report: bool = False, **more) -> None:
     """Write the files, say what became of the plan, and exit with its status."""
     if folder is not None:
         from wholearm_jax.result_file import summary, write_summary, write_torque, write_trajectory
@@ -410,10 +431,19 @@ def _finish(result, folder: Path | None, samples: int, **more) -> None:
             write_trajectory(result, folder / "trajectory.csv", samples)
             write_summary(summary(result, **more), folder / "summary.json")
             _draw(result, folder)
+            if report:
+                _write_report(folder, folder / "report.html")
         except OSError as error:
             raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
     print(result.message if not folder else f"{result.message} -> {folder}")
     sys.exit(0 if result.status.value == 0 else 1)
+
+
+def _write_report(folder: Path, path: Path) -> None:
+    from wholearm_jax.report import report as page
+    from wholearm_jax.writing import write_whole
+
+    write_whole(path, page(folder))
 
 
 def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> None:
@@ -435,9 +465,9 @@ def _draw_execution(done, folder: Path, video: bool) -> None:
 
     from wholearm_jax.drawing import animate, draw_execution, draw_execution_strip
 
-    _save_figure(draw_execution(done), folder, "execution")
+    _save_figure(lambda: draw_execution(done), folder, "execution")
     if video:
-        _save_figure(draw_execution_strip(done), folder, "frames")
+        _save_figure(lambda: draw_execution_strip(done), folder, "frames")
         animate(done).save(folder / "execution.gif", writer="pillow")  # which needs no further program
         plt.close("all")
 
@@ -448,20 +478,24 @@ def _draw(result, folder: Path) -> None:
 
     figures = {"plan": draw_strip, "result": draw_result} if trajectory(result) else {}  # no motion, nothing to draw
     for name, draw in figures.items():
-        _save_figure(draw(result), folder, name)
+        _save_figure(partial(draw, result), folder, name)
 
 
-def _save_figure(figure, folder: Path, name: str) -> None:
+def _save_figure(draw, folder: Path, name: str) -> None:
+    """Draw with the settings of a paper; write it to look at, and as vectors for the web and for print."""
     import io
 
     import matplotlib.pyplot as plt
 
+    from wholearm_jax.drawing import PAPER
     from wholearm_jax.writing import write_whole
 
-    for kind in ("png", "svg"):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=kind, dpi=150, bbox_inches="tight")
-        write_whole(folder / f"{name}.{kind}", buffer.getvalue())
+    with plt.rc_context(PAPER):
+        figure = draw().flat[0].figure
+        for kind, undated in (("png", {}), ("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format=kind, dpi=250, bbox_inches="tight", metadata=undated)
+            write_whole(folder / f"{name}.{kind}", buffer.getvalue())
     plt.close(figure)
 
 

@@ -12,6 +12,8 @@ keeps its order across slip reversals and the landing carries its own derivative
 
 At rest, with friction, the object starts forward when the acceleration with forward signs is positive, backward when
 the one with backward signs is negative, and stays when neither is; both at once is ambiguous (Painleve).
+
+Derivation: section 6 of `docs/derivation.md`.
 """
 
 from collections.abc import Callable

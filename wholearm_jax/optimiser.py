@@ -79,6 +79,11 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
     The motion's speed is `v ~ u^p (1 - u)^q` in `u = t / duration`: the even `p = q = 1` unless another of `PROFILES`
     allows a larger margin. As the inverse dynamics at the knots only, the schedule carries the object near the wire's
     end, not exactly to it.
+
+    Derivation, section 8. Returns `knots` rows a phase.
+
+    >>> wa.quasistatic(wa.load("heptagon"), knots=11).values.shape
+    (22, 2)
     """
     traced = traced or trace(scene)
     pairs = zip(traced, scene.phases, strict=True)
@@ -87,7 +92,14 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
 
 
 def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...]:
-    """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.bound`)."""
+    """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.bound`).
+
+    Derivation, section 8: a tuple of `Bound`, one a phase, with `value` [N], and `s` and `share` of the wire where
+    it is tight.
+
+    >>> [f"{float(bound.value):.3f} N" for bound in wa.bounds(wa.load("heptagon"))]
+    ['0.966 N', '0.838 N']
+    """
     traced = traced or trace(scene)
     begins = [True, *(p.arrive != "moving" for p in scene.phases[:-1])]
     rows = zip(traced, scene.phases, begins, strict=True)
@@ -115,6 +127,12 @@ def optimise(
     margin comes within `tolerance` of the bound or no longer improves by that share, or after `steps`. `callback` sees
     every step; `traced` reuses the result of `trace`. Where no torque can hold a formation, nothing is searched and the
     status says so.
+
+    Derivation, section 9. Raises RuntimeError without float64.
+
+    >>> found = wa.optimise(wa.load("heptagon"))
+    >>> found.result.status.label, [f"{share:.2f}" for share in found.reached]
+    ('ok', ['1.00', '1.00'])
     """
     require_x64()
     joint, rows = _groups(scene), rounded(knots * len(scene.phases))

@@ -162,6 +162,14 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     The table of a phase is refined (panels doubled, up to 512) until its interpolation error, relative to each
     function's size, is below `tolerance`; pieces are added likewise. What cannot be traced says so in
     `Traced.table.status`, and what follows it cannot be trusted.
+
+    The paper's "set of C-functions equated to zero", solved along the whole wire (derivation, section 3).
+
+    >>> traced = wa.trace(wa.load("heptagon"))
+    >>> [wa.Status(int(one.table.status)).label for one in traced]
+    ['ok', 'ok']
+    >>> print(f"{float(traced[0].table.length):.2f} object radii")
+    1.33 object radii
     """
     solid, rough, found = body(scene.object), scene.start, []
     for phase in scene.phases:
@@ -238,6 +246,13 @@ def margin(
     Differentiable, in forward and reverse mode, with respect to the torques and every float of the scene; negative
     where a contact would pull; `-inf` where a phase has no motion to score. Whether the plan succeeds is for
     `simulate` to say.
+
+    The forces are those of the paper's section 2.2, its `c_n > 0` (derivation, sections 4 and 7). Needs float64:
+    without, wires cannot be traced and the margin is `-inf`.
+
+    >>> scene = wa.load("heptagon")
+    >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")
+    0.70 N
     """
     found = outcomes(scene, torque, trace(scene, resolution=resolution), how)
     return jnp.stack([jnp.where(jnp.isfinite(o.score.margin), o.score.margin, -jnp.inf) for o in found]).min()
@@ -265,6 +280,15 @@ def simulate(
     `tolerance` is the integrator's; `traced` reuses the result of `trace`; `arrival` is how near its wire's end a phase
     must come, as a share of the wire's length. Raises ValueError for a schedule that is shorter than the plan;
     everything else is a status.
+
+    Integrates the paper's eq. (16) (derivation, section 6). Raises RuntimeError without float64.
+
+    >>> scene = wa.load("heptagon")
+    >>> result = wa.simulate(scene, wa.torque([0.0, 2.0], [[0.0, 0.0], [0.0, 0.0]]))
+    >>> result.status.label, result.phases[0].status.label
+    ('stuck', 'stuck')
+    >>> print(result.message)
+    slide left: stuck, t = 1 s: friction holds the object at rest; raise the torque that pushes it, or lower the squeeze
     """
     require_x64()
     require_covered(scene, torque)
@@ -376,7 +400,16 @@ def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shar
 
 
 def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
-    """Every phase at `samples` evenly spaced times; a phase that failed stops there, and later ones are left out."""
+    """Every phase at `samples` evenly spaced times; a phase that failed stops there, and later ones are left out.
+
+    A tuple of `Trajectory`, one a phase: `time` `(samples,)` [s], `z` and `z_dot` `(samples, 5)`, `cn` and `ct`
+    `(samples, 4)` [N].
+
+    >>> scene = wa.load("heptagon")
+    >>> first, *_ = wa.trajectory(wa.simulate(scene, wa.quasistatic(scene)), samples=5)
+    >>> [f"{t:.2f}" for t in first.time.tolist()], first.cn.shape
+    (['0.00', '0.25', '0.50', '0.75', '1.00'], (5, 4))
+    """
     found, schedule, rows = [], _padded(result.torque), -(-samples // SAMPLED) * SAMPLED
     for phase in result.phases:
         if int(phase.traced.table.status) != Status.OK:
