@@ -20,7 +20,8 @@ QUANTILES = (0.0, 0.01, 0.05, 0.5, 0.95, 1.0)
 class Survey:
     """How many of `count` scenes hold and how the others fail.
 
-    `failures` counts (phase, status, contact), by name. `numbers` are the sampled scenes, `margins` [N] theirs.
+    `failures` counts (phase, status, contact), by name. `numbers` are the sampled scenes, `margins` [N] and `statuses`
+    theirs.
     """
 
     count: int
@@ -28,6 +29,7 @@ class Survey:
     failures: dict[tuple[str, str, str | None], int]
     numbers: np.ndarray
     margins: np.ndarray
+    statuses: np.ndarray
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -68,7 +70,7 @@ class Survey:
 def survey(scene: Scene, chunks: Iterable[Checked], count: int) -> Survey:
     """Count through chunks of results; `scene` gives phases and contacts their names."""
     every, first, holds, failures = max(1, -(-count // SAMPLE)), 0, 0, Counter()
-    numbers, margins = [], []
+    numbers, margins, statuses = [], [], []
     for part in chunks:
         bad = part.status != Status.OK
         holds += int((~bad).sum())
@@ -82,8 +84,9 @@ def survey(scene: Scene, chunks: Iterable[Checked], count: int) -> Survey:
         kept = np.arange(-first % every, len(part.status), every)
         numbers.append(first + kept)
         margins.append(part.margin[kept])
+        statuses.append(part.status[kept])
         first += len(part.status)
-    return Survey(count, holds, dict(failures), np.concatenate(numbers), np.concatenate(margins))
+    return Survey(count, holds, dict(failures), *(np.concatenate(column) for column in (numbers, margins, statuses)))
 
 
 def influences(margins: Float[np.ndarray, "n"], shifts: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "p"]:
