@@ -13,9 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-import wholearm_jax as wa
 from wholearm_jax.batch import Checked
-from wholearm_jax.result_file import write_torque
 from wholearm_jax.store import TYPES, StoreError, identity, open_store
 
 zarr = pytest.importorskip("zarr")
@@ -23,13 +21,11 @@ COUNT, CHUNK, KILLS = 6, 1, 3
 
 
 @pytest.fixture(scope="module")
-def command(tmp_path_factory):
+def command():
     """The command as a list that lacks only where its store goes."""
-    torque = tmp_path_factory.mktemp("schedule") / "torque.csv"
-    write_torque(wa.quasistatic(wa.load("heptagon")), torque)
+    torque = Path(__file__).parent / "data" / "heptagon_torque.csv"
     varied = ["--vary", "vertices=0.0002", "--vary", "friction=10%", "--count", str(COUNT), "--chunk", str(CHUNK)]
-    # The programs of test_batch.py: full resolution only.
-    settings = ["--seed", "3", "--arrival", "0.02", "--tolerance", "1e-10"]
+    settings = ["--seed", "3", "--arrival", "0.02", "--tolerance", "1e-10"]  # one program: the full resolution
     run = "from wholearm_jax.command import main; main()"
     return [sys.executable, "-c", run, "check", "heptagon", "--torque", str(torque), *varied, *settings]
 
