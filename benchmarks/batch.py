@@ -7,8 +7,8 @@ one process: checks over the size of the batch, checks with the gradient of the 
 optimisations, one process against two, the largest difference of a margin from the full resolution, compile times (the
 first call's, nothing kept) and peak memory. Beside them MuJoCo's rollouts of the same plan with the same scenes on all
 threads, at the longest of some time steps whose object ends within 1 % of its way from the prediction (`pose`), and at
-the longest whose least force is within 1 % of the predicted one, or else the shortest (`margin`; phases of equal length,
-twentieths of a phase at its ends are left out, where soft contacts take over).
+the longest whose least force is within 1 % of the predicted one, or else the shortest (`margin`; phases are of equal
+length, and twentieths of a phase at its ends are left out, where soft contacts take over).
 """
 
 import argparse
