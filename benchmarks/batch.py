@@ -212,8 +212,12 @@ def main() -> None:
     }
     kept = measure.RESULTS / "batch.json"
     found = json.loads(kept.read_text()) if given.only else {}
-    found |= {name: part() for name, part in parts.items() if given.only in (None, name)}
-    draw(found, measure.save("batch", found).with_suffix(".svg"))
+    found.pop("machine", None)
+    for name, part in parts.items():
+        if given.only in (None, name):
+            found[name] = part()
+            measure.save("batch", found)
+    draw(found, kept.with_suffix(".svg"))
 
 
 if __name__ == "__main__":
