@@ -403,14 +403,15 @@ def draw_survey(
     them the figure is the histogram alone.
     """
     panels = 1 + bool(influence) + (len(parameters) == 2)
-    if axes is None:
-        axes = plt.subplots(1, panels, figsize=(3.1 * panels, 2.9), layout="constrained", squeeze=False)[1][0]
-    _draw_margins(told, axes[0])
+    drawn: Sequence[Axes] = axes or list(
+        plt.subplots(1, panels, figsize=(3.1 * panels, 2.9), layout="constrained", squeeze=False)[1][0]
+    )
+    _draw_margins(told, drawn[0])
     if influence:
-        _draw_influence(influence, axes[1])
+        _draw_influence(influence, drawn[1])
     if len(parameters) == 2:
-        _draw_map(told, parameters, axes[panels - 1])
-    return axes
+        _draw_map(told, parameters, drawn[panels - 1])
+    return drawn
 
 
 def _draw_margins(told: Survey, ax: Axes) -> None:

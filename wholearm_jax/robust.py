@@ -94,7 +94,7 @@ def optimise_robustly(
             best, best_held = torque, now
         slope = jnp.where(jnp.isfinite(found.slope), found.slope, 0.0) * limit
         moves, state = adam.update(-slope, state)
-        share = jnp.clip(optax.apply_updates(share, moves), -1.0, 1.0)
+        share = jnp.clip(jnp.asarray(optax.apply_updates(share, moves)), -1.0, 1.0)
     assert nominally is not None
     return Robust(
         best,
