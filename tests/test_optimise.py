@@ -7,9 +7,9 @@ import optax
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.scene_file import to_dict
 from wholearm_jax.descent import COLDEST, JOINED
 from wholearm_jax.plan import simulate
+from wholearm_jax.scene_file import to_dict
 from wholearm_jax.verdict import ARRIVAL
 
 # Largest minimum force [N] that direct collocation reached on the same plans at 1 s a phase, equal to the bound.
