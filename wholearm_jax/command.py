@@ -111,6 +111,8 @@ def optimise(
     from wholearm_jax.optimiser import optimise as find
 
     begun = time.perf_counter()
+    compile_ahead(loaded, knots=knots)
+    traced = _traced(scene, loaded)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bars = [progress.add_task(p.name, total=steps, state="waiting") for p in loaded.phases]
@@ -120,8 +122,6 @@ def optimise(
             progress.update(bars[step.phase], completed=step.step + 1, state=state)
 
         progress.update(bars[0], state="compiling")
-        compile_ahead(loaded, knots=knots)
-        traced = _traced(scene, loaded)
         found = find(loaded, knots=knots, steps=steps, rate_limit=rate_limit, callback=show, traced=traced)
         for bar, why in zip(bars, found.stopped, strict=True):
             progress.update(bar, completed=steps, state=why)
