@@ -116,7 +116,7 @@ def test_a_store_goes_on_and_ends_the_same(tmp_path, ensemble, schedule):
     for number, part in found.items():
         whole.write(number, part._asdict())
     broken.write(1, found[1]._asdict())
-    broken.group["margin"][0:2] = [7.0, 7.0]  # stopped before `done`
+    broken.array("margin")[0:2] = [7.0, 7.0]  # stopped before `done`
     again = open_store(tmp_path / "broken", wanted)
     missing = [k for k in range(again.chunks) if not again.done()[k]]
     assert missing == [0, 2]

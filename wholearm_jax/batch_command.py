@@ -250,7 +250,7 @@ def _report(store, scene, source, out: Path):
         more = {"influence": {name: rank for name, rank in pairs if rank}}
     try:
         write_whole(out.with_suffix(".json"), json.dumps(told.as_dict() | more, indent=1) + "\n")
-        figure = draw_survey(told, shown)[0].figure
+        figure = draw_survey(told, more.get("influence"), shown)[0].figure
         for kind in ("png", "svg"):
             import io
 

@@ -20,6 +20,7 @@ from wholearm_jax.palette import CONTACT_COLOURS, DASHES, contact_styles
 from wholearm_jax.palette import LINK_COLOURS as COLOURS
 from wholearm_jax.plan import Result, trajectory
 from wholearm_jax.scene import Scene, body, parse_contact
+from wholearm_jax.status import Status
 from wholearm_jax.survey import Survey
 
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
@@ -50,6 +51,7 @@ PAPER: dict[Any, Any] = {
 Figures are then `COLUMN` or `PAGE` inches wide, with letters of 7 and 8 points."""
 
 _INK, _FILL, _PALE = "#222222", "#E8EEF4", "#999999"
+_HOLDS, _FATES = "#009E73", ("#D55E00", "#E69F00", "#56B4E9", "#CC79A7", "#8B6914", "#999999")  # of scenes in a survey
 
 
 def draw_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbers: bool = False) -> Axes:
@@ -389,24 +391,67 @@ def _legend_beside(ax: Axes) -> Axes:
     return ax
 
 
-def draw_survey(told: Survey, parameters: Sequence[tuple[str, np.ndarray]] = ()) -> list[Axes]:
-    """A histogram of the sampled margins and, over the two `parameters` (name, shares of their amounts), a map."""
-    finite = np.isfinite(told.margins)
-    margins = told.margins[finite]
-    figure, axes = plt.subplots(1, 1 + (len(parameters) == 2), figsize=(7.2, 2.9), layout="constrained", squeeze=False)
-    left = axes[0, 0]
-    left.hist(margins, bins=60, color=COLOURS[0])
-    left.axvline(0.0, color=_INK, lw=0.8)
-    low, high = (100 * end for end in told.interval)
-    left.set(xlabel="margin [N]", ylabel="scenes", title=f"{low:.1f} to {high:.1f} % hold")
+def draw_survey(
+    told: Survey,
+    influence: dict[str, float] | None = None,
+    parameters: Sequence[tuple[str, np.ndarray]] = (),
+    axes: Sequence[Axes] | None = None,
+) -> Sequence[Axes]:
+    """Margins by what became of the scenes; what the margin depends on most; its mean over two `parameters`.
+
+    `influence` are rank correlations by name, `parameters` names and shifts of the sampled scenes in [-1, 1]; without
+    them the figure is the histogram alone.
+    """
+    panels = 1 + bool(influence) + (len(parameters) == 2)
+    if axes is None:
+        axes = plt.subplots(1, panels, figsize=(3.1 * panels, 2.9), layout="constrained", squeeze=False)[1][0]
+    _draw_margins(told, axes[0])
+    if influence:
+        _draw_influence(influence, axes[1])
     if len(parameters) == 2:
-        (across, x), (up, y) = parameters
-        right = axes[0, 1]
-        edges = np.linspace(-1.0, 1.0, int(np.clip(np.sqrt(len(margins) / 8), 2, 40)) + 1)
-        number, *_ = np.histogram2d(y[finite], x[finite], bins=(edges, edges))
-        total, *_ = np.histogram2d(y[finite], x[finite], bins=(edges, edges), weights=margins)
-        mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
-        image = right.pcolormesh(edges, edges, mean, cmap="viridis")
-        right.set(xlabel=f"{across} (share of its amount)", ylabel=up)
-        figure.colorbar(image, ax=right, label="mean margin [N]")
-    return list(axes[0])
+        _draw_map(told, parameters, axes[panels - 1])
+    return axes
+
+
+def _draw_margins(told: Survey, ax: Axes) -> None:
+    finite = np.isfinite(told.margins)
+    found = [status for status in Status if np.any(told.statuses[finite] == status)]
+    groups = [told.margins[finite & (told.statuses == status)] for status in found]
+    colours = [_HOLDS if status is Status.OK else _FATES[k % len(_FATES)] for k, status in enumerate(found)]
+    bins = int(np.clip(np.sqrt(finite.sum()), 8, 60))
+    if groups:
+        names = ["holds" if status is Status.OK else status.label.replace("_", " ") for status in found]
+        ax.hist(groups, bins=bins, stacked=True, color=colours, label=names)
+        ax.legend(frameon=False, fontsize=7)
+    if ax.get_xlim()[0] < 0:
+        ax.axvline(0.0, color=_INK, lw=0.8)
+    low, high = (100 * end for end in told.interval)
+    ax.set_title(f"{100 * told.holds / told.count:.3g} % hold ({low:.3g} to {high:.3g} %)", fontsize=9)
+    ax.set(xlabel="margin [N]", ylabel="scenes")
+    ax.spines[["top", "right"]].set_visible(False)
+
+
+def _draw_influence(influence: dict[str, float], ax: Axes, most: int = 8) -> None:
+    shown = sorted(influence.items(), key=lambda item: -abs(item[1]))[:most]
+    names, ranks = zip(*shown, strict=True)
+    ax.barh(names, ranks, height=0.7, color=[COLOURS[0] if rank > 0 else COLOURS[1] for rank in ranks])
+    ax.axvline(0.0, color=_INK, lw=0.8)
+    ax.invert_yaxis()
+    ax.tick_params(axis="y", length=0, labelsize=8)
+    ax.set_title("what the margin depends on", fontsize=9)
+    ax.set_xlabel("rank correlation")
+    ax.spines[["top", "right", "left"]].set_visible(False)
+
+
+def _draw_map(told: Survey, parameters: Sequence[tuple[str, np.ndarray]], ax: Axes) -> None:
+    """The mean margin in squares that hold two dozen scenes or more."""
+    (across, x), (up, y) = parameters
+    finite = np.isfinite(told.margins)
+    edges = np.linspace(-1.0, 1.0, int(np.clip(np.sqrt(finite.sum() / 24), 2, 40)) + 1)
+    number, *_ = np.histogram2d(y[finite], x[finite], bins=(edges, edges))
+    total, *_ = np.histogram2d(y[finite], x[finite], bins=(edges, edges), weights=told.margins[finite])
+    mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+    image = ax.pcolormesh(edges, edges, mean, cmap="cividis", rasterized=True)
+    ax.set(xlabel=f"{across}, share of its range", ylabel=f"{up}, share of its range", aspect="equal")
+    ax.set_title("mean margin [N]", fontsize=9)
+    plt.colorbar(image, ax=ax)

@@ -43,9 +43,8 @@ def fingerprint(*trees: Any) -> str:
 class Store:
     """Results of `count` scenes in chunks of `chunk`; with `torques`, a schedule of that many rows a scene."""
 
-    def __init__(self, path: Path, group: zarr.Group):
-        self.path, self.group = path, group
-        self.count, self.chunk = (int(group.attrs["identity"][key]) for key in ("count", "chunk"))
+    def __init__(self, path: Path, group: zarr.Group, count: int, chunk: int):
+        self.path, self.group, self.count, self.chunk = path, group, count, chunk
 
     @property
     def chunks(self) -> int:
@@ -54,22 +53,31 @@ class Store:
 
     def done(self) -> np.ndarray:
         """Which chunks are complete."""
-        return np.asarray(self.group["done"][:]).astype(bool)
+        return np.asarray(self.array("done")[:]).astype(bool)
+
+    def array(self, name: str) -> zarr.Array:
+        """One of the arrays, on disk."""
+        array = self.group[name]
+        assert isinstance(array, zarr.Array)
+        return array
+
+    def rows(self, number: int) -> slice:
+        """The rows of a chunk."""
+        return slice(number * self.chunk, min(self.count, (number + 1) * self.chunk))
 
     def write(self, number: int, values: Mapping[str, np.ndarray]) -> None:
         """Write a chunk of every array, and then that it is done."""
-        rows = slice(number * self.chunk, min(self.count, (number + 1) * self.chunk))
         try:
             for name, column in values.items():
-                self.group[name][rows] = np.asarray(column).astype(self.group[name].dtype)
-            self.group["done"][number] = 1
+                array = self.array(name)
+                array[self.rows(number)] = np.asarray(column).astype(array.dtype)
+            self.array("done")[number] = 1
         except OSError as error:
             raise StoreError(f"{self.path}: cannot be written: {error.strerror or error}") from None
 
     def read(self, number: int) -> Checked:
         """A chunk's results."""
-        rows = slice(number * self.chunk, min(self.count, (number + 1) * self.chunk))
-        return Checked(*(np.asarray(self.group[name][rows]) for name in Checked._fields))
+        return Checked(*(np.asarray(self.array(name)[self.rows(number)]) for name in Checked._fields))
 
 
 def identity(count: int, chunk: int, **settings: Any) -> dict[str, Any]:
@@ -94,7 +102,7 @@ def open_store(path: Path, wanted: Mapping[str, Any], torques: int = 0) -> Store
     other = sorted(key for key in {*held, *wanted} if held.get(key) != wanted.get(key))
     if other:
         raise StoreError(f"{path}: is of another {', '.join(other)}; give another --out, or the same command")
-    return Store(path, group)
+    return Store(path, group, int(wanted["count"]), int(wanted["chunk"]))
 
 
 def _made(path: Path, wanted: Mapping[str, Any], torques: int, again: bool = False) -> Store:
@@ -113,7 +121,7 @@ def _made(path: Path, wanted: Mapping[str, Any], torques: int, again: bool = Fal
         group.attrs["identity"] = dict(wanted)
     except OSError as error:
         raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from None
-    return Store(path, group)
+    return Store(path, group, count, chunk)
 
 
 def _add(group: zarr.Group, name: str, kind: str, fill, shape: tuple[int, ...], chunk: int) -> None:

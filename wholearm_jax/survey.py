@@ -20,7 +20,8 @@ QUANTILES = (0.0, 0.01, 0.05, 0.5, 0.95, 1.0)
 class Survey:
     """How many of `count` scenes hold and how the others fail.
 
-    `failures` counts (phase, status, contact), by name. `numbers` are the sampled scenes, `margins` [N] theirs.
+    `failures` counts (phase, status, contact), by name. `numbers` are the sampled scenes, `margins` [N] and `statuses`
+    theirs.
     """
 
     count: int
@@ -28,6 +29,7 @@ class Survey:
     failures: dict[tuple[str, str, str | None], int]
     numbers: np.ndarray
     margins: np.ndarray
+    statuses: np.ndarray
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -54,21 +56,21 @@ class Survey:
     def as_dict(self) -> dict:
         """The survey for a JSON file."""
         keys = ("phase", "status", "contact", "count")
-        failures = [dict(zip(keys, (*key, many), strict=True)) for key, many in self.failures.items()]
+        often = sorted(self.failures.items(), key=lambda item: -item[1])
         return {
             "count": self.count,
             "holds": self.holds,
             "share": self.holds / self.count,
             "interval": list(self.interval),
             "quantiles": {q: m if np.isfinite(m) else None for q, m in self.quantiles.items()},
-            "failures": sorted(failures, key=lambda row: -row["count"]),
+            "failures": [dict(zip(keys, (*key, many), strict=True)) for key, many in often],
         }
 
 
 def survey(scene: Scene, chunks: Iterable[Checked], count: int) -> Survey:
     """Count through chunks of results; `scene` gives phases and contacts their names."""
     every, first, holds, failures = max(1, -(-count // SAMPLE)), 0, 0, Counter()
-    numbers, margins = [], []
+    numbers, margins, statuses = [], [], []
     for part in chunks:
         bad = part.status != Status.OK
         holds += int((~bad).sum())
@@ -82,8 +84,9 @@ def survey(scene: Scene, chunks: Iterable[Checked], count: int) -> Survey:
         kept = np.arange(-first % every, len(part.status), every)
         numbers.append(first + kept)
         margins.append(part.margin[kept])
+        statuses.append(part.status[kept])
         first += len(part.status)
-    return Survey(count, holds, dict(failures), np.concatenate(numbers), np.concatenate(margins))
+    return Survey(count, holds, dict(failures), *(np.concatenate(column) for column in (numbers, margins, statuses)))
 
 
 def influences(margins: Float[np.ndarray, "n"], shifts: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "p"]:
