@@ -133,7 +133,8 @@ def draw_forces(result: Result, ax: Axes | None = None) -> Axes:
                 slack = grip * course.cn[:, k] - np.abs(course.ct[:, k])
                 label = label and r"$\mu c_n - |c_t|$ of it"
                 ax.plot(course.time, slack, color=colour[0], ls=":", lw=1.6, label=label)
-    worst = min(result.phases, key=lambda p: p.margin)
+    _draw_holds(result, ax)
+    worst = result.hardest
     if np.isfinite(worst.margin):
         ax.plot(worst.margin_time, worst.margin, "o", color=_INK, ms=4, zorder=5)
         ax.axhline(worst.margin, color=_PALE, lw=0.8, zorder=0)
@@ -152,6 +153,16 @@ def draw_forces(result: Result, ax: Axes | None = None) -> Axes:
     ax.set_ylim(min(low, -0.06 * high), high)
     _finish(ax, result)
     return ax
+
+
+def _draw_holds(result: Result, ax: Axes) -> None:
+    """Times at which friction holds the object at rest, shaded, with what the contacts can bear there."""
+    label = "held: the best least force"
+    for held in (held for phase in result.phases for held in phase.holds):
+        ax.axvspan(held.start, held.end, color=_PALE, alpha=0.35, lw=0, zorder=0)
+        if np.isfinite(held.margin):
+            ax.hlines(held.margin, held.start, held.end, color=_INK, lw=1.0, ls="--", label=label)
+            label = None
 
 
 def draw_result(result: Result) -> Figure:
