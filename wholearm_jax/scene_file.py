@@ -265,6 +265,7 @@ _WORDS = {
     "missing": "missing",
     "float_type": "must be a number",
     "finite_number": "must be finite",
+    "bool_type": "must be true or false",
     "string_type": "must be text",
     "list_type": "must be a list",
     "tuple_type": "must be a list",
