@@ -102,7 +102,7 @@ def follow(wire: Wire, table: Table, scene: Scenes, how: Integration) -> Followe
     motion = move(table, seen, scene.duration, how=how)
     found = score(table, seen, scene.duration, motion, how)
     entered = change(table, jnp.zeros_like(scene.rough))
-    verdict, moving = (judge(table, motion, found, at_rest, entered) for at_rest in (True, False))
+    verdict, moving = (judge(table, motion, found, at_rest, entered) for at_rest in (1, 0))
     end, s, w = (values[motion.count] for values in (motion.share, motion.s, motion.w))
     steps = arcs(table, seen, scene.duration, motion)
     unit = configuration_unit(jnp.sqrt((solid_vertices(scene) ** 2).sum(1).max()))

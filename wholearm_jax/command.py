@@ -158,6 +158,8 @@ def simulate(
     result = _predicted(loaded, schedule, torque, tolerance, traced)
     for phase in result.phases:
         print(phase.message)
+        for held in phase.holds:
+            print(f"    {held.message}")
     if check_gradient:
         _check_gradient(loaded, schedule)
     tops = tuple(float(b.value) for b in bounds(loaded, traced=traced))
@@ -199,8 +201,8 @@ def formations(
     from rich.console import Console
     from rich.table import Table
 
-    from wholearm_jax.formations import leaving, start_configuration, touching, ways
-    from wholearm_jax.plan import end_configuration
+    from wholearm_jax.formations import leaving, touching, ways
+    from wholearm_jax.plan import destination, start_configuration
 
     traced = _traced(scene, loaded)
     if after is None:
@@ -210,7 +212,8 @@ def formations(
         if row is None:
             names = ", ".join(p.name for p in loaded.phases)
             raise BadInput(f"--after {after}: no such phase; phases: {names}")
-        z, z_dot = end_configuration(traced[row]), leaving(traced[row].table)
+        z = destination(loaded.phases[row], traced[row])
+        z_dot = None if loaded.phases[row].arrive == "hold" else leaving(traced[row].table)
     found = ways(loaded, z, z_dot)
     table = Table(title=f"touching: {', '.join(touching(loaded, z))}")
     for column in ("contacts", "toward", "leads to", "length", "static N", "bound N", "enter at speed"):
@@ -346,7 +349,7 @@ def _traced(name: str, scene):
     import numpy as np
 
     from wholearm_jax.contacts import constraints, frames, placed
-    from wholearm_jax.plan import end_configuration, trace
+    from wholearm_jax.plan import destination, trace
     from wholearm_jax.scene import body
     from wholearm_jax.system import system
 
@@ -363,7 +366,7 @@ def _traced(name: str, scene):
     for k, (phase, at) in enumerate(zip(scene.phases, traced, strict=True)):
         if int(at.table.status) == 0:
             continue
-        rough = end_configuration(traced[k - 1]) if k > 0 else scene.start
+        rough = destination(scene.phases[k - 1], traced[k - 1]) if k > 0 else scene.start
         gap, length, unit = apart(phase.formation, at.wire.start, rough)
         where = "with the others, from this start"
         if k > 0 and not np.any(gap > 1e-6):

@@ -170,6 +170,7 @@ def draw_forces(result: Result, ax: Axes | None = None, *, legend: bool = True) 
                 slack = grip * course.cn[:, k] - np.abs(course.ct[:, k])
                 label = label and r"its $\mu c_n - |c_t|$"
                 ax.plot(course.time, slack, color=colour, ls=":", label=label)
+    _draw_holds(result, ax)
     ax.set_ylabel("contact force $c_n$ [N]")
     ax.autoscale(axis="y")  # with what other axes hold that share this one
     low, high = ax.get_ylim()
@@ -179,9 +180,19 @@ def draw_forces(result: Result, ax: Axes | None = None, *, legend: bool = True) 
     return _legend(ax, 3) if legend else ax
 
 
+def _draw_holds(result: Result, ax: Axes) -> None:
+    """Times at which friction holds the object at rest, shaded, with what the contacts can bear there."""
+    label = "held: the best least force"
+    for held in (held for phase in result.phases for held in phase.holds):
+        ax.axvspan(held.start, held.end, color=_PALE, alpha=0.35, lw=0, zorder=0)
+        if np.isfinite(held.margin):
+            ax.hlines(held.margin, held.start, held.end, color=_INK, lw=1.0, ls="--", label=label)
+            label = None
+
+
 def _mark_margin(result: Result, ax: Axes) -> None:
     """A dot at the margin, and its words below the curves."""
-    worst = min(result.phases, key=lambda p: p.margin)
+    worst = result.hardest
     if not np.isfinite(worst.margin):
         return
     ax.axhline(worst.margin, color=_PALE, lw=0.6, zorder=0)
