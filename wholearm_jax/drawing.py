@@ -157,12 +157,12 @@ def draw_forces(result: Result, ax: Axes | None = None) -> Axes:
 
 def _draw_holds(result: Result, ax: Axes) -> None:
     """Times at which friction holds the object at rest, shaded, with what the contacts can bear there."""
-    label = "held: the best least force"
+    label: str = "held: the best least force"
     for held in (held for phase in result.phases for held in phase.holds):
         ax.axvspan(held.start, held.end, color=_PALE, alpha=0.35, lw=0, zorder=0)
         if np.isfinite(held.margin):
             ax.hlines(held.margin, held.start, held.end, color=_INK, lw=1.0, ls="--", label=label)
-            label = None
+            label = "_nolegend_"
 
 
 def draw_result(result: Result) -> Figure:
