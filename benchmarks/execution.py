@@ -16,9 +16,9 @@ import numpy as np
 from measure import RESULTS, save
 
 import wholearm_jax as wa
-from wholearm_jax.drawing import COLOURS
 from wholearm_jax.execution import execute
 from wholearm_jax.free_bodies import Softness
+from wholearm_jax.palette import LINK_COLOURS as COLOURS
 
 jax.config.update("jax_enable_x64", True)
 

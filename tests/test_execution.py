@@ -220,10 +220,10 @@ def test_figures(executions, tmp_path):
     import matplotlib.pyplot as plt
 
     done = executions["heptagon"]
-    figure = draw_execution(done)
-    labels = [text.get_text() for text in figure.axes[2].get_yticklabels()]
+    axes = draw_execution(done)
+    labels = [text.get_text() for text in axes[2].get_yticklabels()]
     assert set(labels) >= set(done.planned)
-    draw_execution_strip(done, 4).savefig(tmp_path / "strip.png")
+    draw_execution_strip(done, 4)[0, 0].figure.savefig(tmp_path / "strip.png")
     animate(done, 2).save(tmp_path / "motion.gif", writer="pillow")
     assert (tmp_path / "motion.gif").stat().st_size > 5_000
     plt.close("all")

@@ -6,6 +6,7 @@ Read the modules in this order: `scene`, `contacts`, `system`, `wire` (trace), `
 """
 
 from wholearm_jax.baseline import search
+from wholearm_jax.batch import check
 from wholearm_jax.motion import Integration
 from wholearm_jax.optimiser import bounds, optimise, quasistatic
 from wholearm_jax.plan import margin, simulate, trace, trajectory
@@ -14,6 +15,7 @@ from wholearm_jax.scene import Scene
 from wholearm_jax.scene_file import SceneError, load, parse, save
 from wholearm_jax.schedule import Torque, torque
 from wholearm_jax.status import Status
+from wholearm_jax.variation import vary
 
 __all__ = [
     "Integration",
@@ -22,6 +24,7 @@ __all__ = [
     "Status",
     "Torque",
     "bounds",
+    "check",
     "load",
     "margin",
     "optimise",
@@ -34,5 +37,6 @@ __all__ = [
     "torque",
     "trace",
     "trajectory",
+    "vary",
     "write_torque",
 ]

@@ -6,6 +6,8 @@ the torque of the pushing finger is raised by 10 % until the object begins to mo
 compressive, and lowered by 10 % when a contact opens; the last torque that works is recorded. Each phase therefore
 begins with a step in the torque, and ends as soon as its wire does, at whatever speed: a phase of the search arrives
 `caught`, and the next is taken to start from rest.
+
+Derivation: section 10 of `docs/derivation.md`.
 """
 
 import time
@@ -44,6 +46,12 @@ def search(scene: Scene, *, longest: float = 10.0) -> Searched:
 
     A phase for which no raise works keeps the attempt with the largest margin, and the result's status says what it
     does. Raises ValueError for a plan with a phase that holds the object.
+
+    The paper's section 3.1 (derivation, section 10). Raises RuntimeError without float64.
+
+    >>> found = wa.search(wa.load("hexagon"))
+    >>> found.result.status.label, found.torque.values.shape
+    ('ok', (4, 2))
     """
     require_x64()
     for phase in scene.phases:

@@ -1,4 +1,4 @@
-"""The command line: `wholearm optimise`, `simulate`, `search`, `formations`, `execute`, `scenes`.
+"""The command line: `wholearm optimise`, `simulate`, `search`, `check`, `report`, `formations`, `execute`, `scenes`.
 
 Exit status 0 when the result is `ok`, 1 when the plan fails (its status is printed), 2 for bad input, in one line.
 """
@@ -6,26 +6,27 @@ Exit status 0 when the result is `ok`, 1 when the plan fails (its status is prin
 import os
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import jax
 import typer
 
+from wholearm_jax.arguments import BadInput, SceneName, TorqueFile
+from wholearm_jax.batch_command import ARRIVAL, check, ensemble, optimise_robustly
+
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
-SceneName = Annotated[str, typer.Argument(help="A bundled scene's name, or the path of a scene file.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for torque.csv, trajectory.csv, summary.json and figures.")]
 Changes = Annotated[
     list[str] | None,
     typer.Option("--set", help="PHASE.duration=SECONDS; PHASE is a name or a number from 0. May be repeated."),
 ]
-TorqueFile = Annotated[Path, typer.Option("--torque", help="Torque schedule, CSV with the header t,tau1,tau2.")]
 Samples = Annotated[int, typer.Option(min=2, help="Rows a phase in trajectory.csv.")]
 
 
-class _BadInput(Exception):
-    """What the user gave cannot be used; the message is one line."""
+app.command()(check)
 
 
 def main() -> None:
@@ -35,12 +36,13 @@ def main() -> None:
     os.environ.setdefault("MPLBACKEND", "agg")
     jax.config.update("jax_enable_x64", True)
     _keep_compiled()
-    _compile_quickly()
+    if sys.argv[1:2] != ["check"]:  # many scenes at once run longer than they compile
+        compile_quickly()
     from wholearm_jax.scene_file import SceneError
 
     try:
         app()
-    except (SceneError, _BadInput) as error:
+    except (SceneError, BadInput) as error:
         print(f"wholearm: {error}", file=sys.stderr)
         sys.exit(2)
 
@@ -54,7 +56,7 @@ def _keep_compiled() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
-def _compile_quickly() -> None:
+def compile_quickly() -> None:
     """Have XLA emit kernels in its older way: half of the compile time, at a tenth more run time for one scene.
 
     XLA refuses flags that it does not know: this is for the version that was measured.
@@ -82,11 +84,26 @@ def optimise(
     knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase.")] = 51,
     steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 120,
     rate_limit: Annotated[float | None, typer.Option(min=0.0, help="Largest torque rate [N m/s].")] = None,
-    samples: Samples = 201,
+    samples: Annotated[
+        int | None, typer.Option(min=2, help="Rows a phase in trajectory.csv (201), or samples.")
+    ] = None,
+    robust: Annotated[
+        list[str] | None, typer.Option(help="QUANTITY=AMOUNT: the best torques for --samples (64) varied scenes.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the varied scenes.")] = 0,
+    arrival: Annotated[float, typer.Option(min=1e-9, max=1.0, help="As of `check`, for --robust.")] = ARRIVAL,
+    report: Annotated[bool, typer.Option("--report", help="Also report.html, one page with an animation.")] = False,
 ) -> None:
     """Find the torques with the largest compressive margin, and check them by simulation."""
+    if report and out is None:
+        raise BadInput("--report: needs a folder to write to: add --out DIR")
     loaded = _scene(scene, set_)
     folder = _folder(out)
+    if robust:
+        if rate_limit is not None:
+            raise BadInput("--robust: knows no --rate-limit")
+        optimise_robustly(ensemble(loaded, robust, seed), folder, samples or 64, knots, steps, arrival)
+    samples = samples or 201
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -94,6 +111,8 @@ def optimise(
     from wholearm_jax.optimiser import optimise as find
 
     begun = time.perf_counter()
+    compile_ahead(loaded, knots=knots)
+    traced = _traced(scene, loaded)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bars = [progress.add_task(p.name, total=steps, state="waiting") for p in loaded.phases]
@@ -103,8 +122,6 @@ def optimise(
             progress.update(bars[step.phase], completed=step.step + 1, state=state)
 
         progress.update(bars[0], state="compiling")
-        compile_ahead(loaded, knots=knots)
-        traced = _traced(scene, loaded)
         found = find(loaded, knots=knots, steps=steps, rate_limit=rate_limit, callback=show, traced=traced)
         for bar, why in zip(bars, found.stopped, strict=True):
             progress.update(bar, completed=steps, state=why)
@@ -114,7 +131,8 @@ def optimise(
         print(f"{phase.message}; bound {float(top.value):.4g} N{reached}; stopped: {why}")
     more = {"command": "optimise", "knots": knots, "steps": len(found.history), "seconds": seconds}
     more |= {"rate_limit": rate_limit, "stopped": list(found.stopped)}
-    _finish(found.result, folder, samples, bounds=tuple(float(b.value) for b in found.bounds), **more)
+    tops = tuple(float(b.value) for b in found.bounds)
+    _finish(found.result, folder, samples, report=report, bounds=tops, **more)
 
 
 @app.command()
@@ -173,7 +191,9 @@ def _check_gradient(scene, schedule) -> None:
 def formations(
     scene: SceneName,
     after: Annotated[str | None, typer.Option(help="A phase, by name or number: list what can follow its end.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for a picture of all ways, formations.svg and .png.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for a picture of all ways: formations.png, .svg, .pdf.")
+    ] = None,
 ) -> None:
     """List the formations of four contacts that hold at a configuration, and where their wires lead."""
     loaded = _scene(scene, None)
@@ -191,7 +211,7 @@ def formations(
         row = _phase_number(loaded, after)
         if row is None:
             names = ", ".join(p.name for p in loaded.phases)
-            raise _BadInput(f"--after {after}: no such phase; phases: {names}")
+            raise BadInput(f"--after {after}: no such phase; phases: {names}")
         z = destination(loaded.phases[row], traced[row])
         z_dot = None if loaded.phases[row].arrive == "hold" else leaving(traced[row].table)
     found = ways(loaded, z, z_dot)
@@ -206,7 +226,7 @@ def formations(
     if folder is not None:
         from wholearm_jax.drawing import draw_ways
 
-        _save_figure(draw_ways(loaded, z, found), folder, "formations")
+        _save_figure(lambda: draw_ways(loaded, z, found), folder, "formations")
 
 
 @app.command()
@@ -225,10 +245,24 @@ def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
 
 
 @app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A folder that optimise, simulate or search wrote.")],
+    out: Annotated[Path | None, typer.Option(help="The page to write; report.html in the folder unless given.")] = None,
+) -> None:
+    """Write a result folder's report: one page with an animation, plots and tables, for any browser, offline."""
+    path = out or folder / "report.html"
+    try:
+        _write_report(folder, path)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
+    print(path)
+
+
+@app.command()
 def execute(
     scene: SceneName,
     torque: TorqueFile,
-    out: Annotated[Path | None, typer.Option(help="Folder for execution.json, .csv, .png, .svg, model.xml.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for execution.json, .csv, figures and model.xml.")] = None,
     timestep: Annotated[float, typer.Option(min=1e-6, max=1e-2, help="Time step [s].")] = 2e-4,
     position: Annotated[float, typer.Option(min=0.0, help="Success: this near the predicted end [m].")] = 5e-4,
     angle: Annotated[float, typer.Option(min=0.0, help="Success: this near the predicted angle [rad].")] = 0.01,
@@ -242,7 +276,7 @@ def execute(
 ) -> None:
     """Execute a torque schedule open loop on free bodies with soft contacts, in MuJoCo."""
     if video and out is None:
-        raise _BadInput("--video: needs a folder to write to: add --out DIR")
+        raise BadInput("--video: needs a folder to write to: add --out DIR")
     shares = _share("--friction", friction), _share("--mass", mass)
     loaded = _scene(scene, None)
     try:
@@ -253,7 +287,7 @@ def execute(
     except ModuleNotFoundError as error:
         if error.name != "mujoco":
             raise
-        raise _BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
+        raise BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
     from wholearm_jax.result_file import read_torque
 
     schedule = read_torque(torque)
@@ -286,7 +320,7 @@ def _share(option: str, text: str) -> float:
     except ValueError:
         share = -1.0
     if not 0 <= share < 1:
-        raise _BadInput(f"{option} {text}: write a share between 0 and 1, e.g. 10% or 0.1")
+        raise BadInput(f"{option} {text}: write a share between 0 and 1, e.g. 10% or 0.1")
     return share
 
 
@@ -297,7 +331,7 @@ def _predicted(scene, schedule, torque: Path, tolerance: float, traced):
     try:
         return follow(scene, schedule, tolerance=tolerance, traced=traced)
     except ValueError as error:
-        raise _BadInput(f"{torque}: {error}") from None
+        raise BadInput(f"{torque}: {error}") from None
 
 
 def _scene(name: str, changes: list[str] | None):
@@ -343,8 +377,8 @@ def _traced(name: str, scene):
             which = phase.formation.names[phase.formation.contact_of_slot[worst]]
             key, size = f"phase[{k}].contacts", float(gap[worst] * length)
             if phase.formation.tangential[worst]:
-                raise _BadInput(f"{name}: {key}: {which} cannot stay in its place {where}: it is off by {size:.3g} m")
-            raise _BadInput(f"{name}: {key}: {which} cannot touch {where}: a gap of {size:.3g} m stays open")
+                raise BadInput(f"{name}: {key}: {which} cannot stay in its place {where}: it is off by {size:.3g} m")
+            raise BadInput(f"{name}: {key}: {which} cannot touch {where}: a gap of {size:.3g} m stays open")
         break  # what follows a wire that cannot be followed has no start
     return traced
 
@@ -359,13 +393,13 @@ def _changed(scene, change: str):
     names = [p.name for p in scene.phases]
     row = _phase_number(scene, phase)
     if field != "duration" or row is None:
-        raise _BadInput(f"--set {change}: write PHASE.duration=SECONDS; phases: {', '.join(names)}")
+        raise BadInput(f"--set {change}: write PHASE.duration=SECONDS; phases: {', '.join(names)}")
     try:
         seconds = float(value)
     except ValueError:
         seconds = float("nan")
     if not 0 < seconds < float("inf"):
-        raise _BadInput(f"--set {change}: a duration is a positive number of seconds")
+        raise BadInput(f"--set {change}: a duration is a positive number of seconds")
     phases = tuple(replace_duration(p, seconds) if k == row else p for k, p in enumerate(scene.phases))
     return eqx.tree_at(lambda s: s.phases, scene, phases)
 
@@ -387,11 +421,11 @@ def _folder(out: Path | None) -> Path | None:
         probe.write_text("")
         probe.unlink()
     except OSError as error:
-        raise _BadInput(f"--out {out}: cannot be written: {error.strerror}") from None
+        raise BadInput(f"--out {out}: cannot be written: {error.strerror}") from None
     return out
 
 
-def _finish(result, folder: Path | None, samples: int, **more) -> None:
+def _finish(result, folder: Path | None, samples: int, report: bool = False, **more) -> None:
     """Write the files, say what became of the plan, and exit with its status."""
     if folder is not None:
         from wholearm_jax.result_file import summary, write_summary, write_torque, write_trajectory
@@ -401,10 +435,19 @@ def _finish(result, folder: Path | None, samples: int, **more) -> None:
             write_trajectory(result, folder / "trajectory.csv", samples)
             write_summary(summary(result, **more), folder / "summary.json")
             _draw(result, folder)
+            if report:
+                _write_report(folder, folder / "report.html")
         except OSError as error:
-            raise _BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
+            raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
     print(result.message if not folder else f"{result.message} -> {folder}")
     sys.exit(0 if result.status.value == 0 else 1)
+
+
+def _write_report(folder: Path, path: Path) -> None:
+    from wholearm_jax.report import report as page
+    from wholearm_jax.writing import write_whole
+
+    write_whole(path, page(folder))
 
 
 def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> None:
@@ -418,7 +461,7 @@ def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> Non
         write_whole(folder / "model.xml", done.model_xml)
         _draw_execution(done, folder, video)
     except OSError as error:
-        raise _BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
+        raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
 
 
 def _draw_execution(done, folder: Path, video: bool) -> None:
@@ -426,9 +469,9 @@ def _draw_execution(done, folder: Path, video: bool) -> None:
 
     from wholearm_jax.drawing import animate, draw_execution, draw_execution_strip
 
-    _save_figure(draw_execution(done), folder, "execution")
+    _save_figure(lambda: draw_execution(done), folder, "execution")
     if video:
-        _save_figure(draw_execution_strip(done), folder, "frames")
+        _save_figure(lambda: draw_execution_strip(done), folder, "frames")
         animate(done).save(folder / "execution.gif", writer="pillow")  # which needs no further program
         plt.close("all")
 
@@ -439,20 +482,24 @@ def _draw(result, folder: Path) -> None:
 
     figures = {"plan": draw_strip, "result": draw_result} if trajectory(result) else {}  # no motion, nothing to draw
     for name, draw in figures.items():
-        _save_figure(draw(result), folder, name)
+        _save_figure(partial(draw, result), folder, name)
 
 
-def _save_figure(figure, folder: Path, name: str) -> None:
+def _save_figure(draw, folder: Path, name: str) -> None:
+    """Draw with the settings of a paper; write it to look at, and as vectors for the web and for print."""
     import io
 
     import matplotlib.pyplot as plt
 
+    from wholearm_jax.drawing import PAPER
     from wholearm_jax.writing import write_whole
 
-    for kind in ("png", "svg"):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=kind, dpi=150, bbox_inches="tight")
-        write_whole(folder / f"{name}.{kind}", buffer.getvalue())
+    with plt.rc_context(PAPER):
+        figure = draw().flat[0].figure
+        for kind, undated in (("png", {}), ("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format=kind, dpi=250, bbox_inches="tight", metadata=undated)
+            write_whole(folder / f"{name}.{kind}", buffer.getvalue())
     plt.close(figure)
 
 

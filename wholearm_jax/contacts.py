@@ -13,6 +13,8 @@ A formation constrains the gap of every contact, and the slip of those that roll
 holonomic: the place `along` its feature at which the contact touches stays `held`, and the constraint
 
     C_t = along - held  (palm, finger 1),  held - along  (finger 2, fingertips),      dC_t/dz = G_t exactly.
+
+Derivation: section 1 of `docs/derivation.md`.
 """
 
 import equinox as eqx

@@ -13,6 +13,8 @@ optax optimiser may take its place (`projected`).
 
 A step follows the curve on which accelerations and squeezes at the knots change evenly (`moved`): on it the intervals
 are nearly linear. Source of the interior point: J. Nocedal and S. J. Wright, Numerical Optimization, 2006, chapter 19.
+
+Derivation: section 9 of `docs/derivation.md`.
 """
 
 from typing import Any, NamedTuple

@@ -7,6 +7,8 @@ Between accepted steps `s(u)` is the quintic with the right `s`, `ds/du` and `d2
 known at every time, not only at steps. The margin is the least slack over continuous time and all contacts: samples
 find its neighbourhood, golden section its place. Its derivative is that of the force at the place found (the envelope
 theorem), landings and knots included.
+
+Derivation: section 7 of `docs/derivation.md`.
 """
 
 import math

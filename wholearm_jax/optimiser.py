@@ -80,6 +80,11 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
     The motion's speed is `v ~ u^p (1 - u)^q` in `u = t / duration`: the even `p = q = 1` unless another of `PROFILES`
     allows a larger margin. As the inverse dynamics at the knots only, the schedule carries the object near the wire's
     end, not exactly to it. A phase that holds the object gets its best torque.
+
+    Derivation, section 8. Returns `knots` rows a phase.
+
+    >>> wa.quasistatic(wa.load("heptagon"), knots=11).values.shape
+    (22, 2)
     """
     traced = traced or trace(scene)
 
@@ -93,8 +98,15 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
 
 
 def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...]:
-    """For each phase the certificate that no torque within limits holds it with a larger margin: `squeeze.bound`, and
-    the best of its statics for one that holds the object."""
+    """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.bound`), or
+    that of the statics for a phase that holds the object.
+
+    Derivation, section 8: a tuple of `Bound`, one a phase, with `value` [N], and `s` and `share` of the wire where
+    it is tight.
+
+    >>> [f"{float(bound.value):.3f} N" for bound in wa.bounds(wa.load("heptagon"))]
+    ['0.966 N', '0.838 N']
+    """
     traced = traced or trace(scene)
     begins = [True, *(p.arrive != "moving" for p in scene.phases[:-1])]
     rows = zip(traced, scene.phases, begins, strict=True)
@@ -133,6 +145,12 @@ def optimise(
     every step; `traced` reuses the result of `trace`. A phase that holds the object keeps its duration and gets the
     best torque of its statics, approached as fast as `rate_limit` allows. Where no torque can hold a formation,
     nothing is searched and the status says so.
+
+    Derivation, section 9. Raises RuntimeError without float64.
+
+    >>> found = wa.optimise(wa.load("heptagon"))
+    >>> found.result.status.label, [f"{share:.2f}" for share in found.reached]
+    ('ok', ['1.00', '1.00'])
     """
     require_x64()
     joint, rows = _groups(scene), rounded(knots * len(scene.phases))

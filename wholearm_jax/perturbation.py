@@ -26,6 +26,7 @@ from wholearm_jax.contacts import gaps, normal_rows
 from wholearm_jax.execution import Ending, Tolerance, clock, judge, motor_torques, require_wires, start_of, target_of
 from wholearm_jax.free_bodies import Softness, free_bodies
 from wholearm_jax.plan import Result
+from wholearm_jax.proportion import wilson
 from wholearm_jax.scene import Formation, Scene, body
 from wholearm_jax.system import system
 
@@ -77,14 +78,6 @@ class Robustness:
         share = 100 * self.successes / len(self.runs)
         span = f"95 % confidence interval {100 * low:.1f} to {100 * high:.1f} %"
         return f"{self.successes} of {len(self.runs)} perturbed executions succeed: {share:.1f} %, {span}"
-
-
-def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's score interval for a proportion; `z` is the normal quantile (default: 95 %)."""
-    rate, weight = successes / trials, z**2 / trials
-    middle = (rate + weight / 2) / (1 + weight)
-    half = z / (1 + weight) * np.sqrt(rate * (1 - rate) / trials + weight / (4 * trials))
-    return max(0.0, float(middle - half)), min(1.0, float(middle + half))
 
 
 def perturb(

@@ -23,7 +23,7 @@ from wholearm_jax.scene import Phase, Scene, body, contact_name
 from wholearm_jax.schedule import Torque, has_steps, padded, window
 from wholearm_jax.status import Status
 from wholearm_jax.system import system
-from wholearm_jax.verdict import ARRIVALS, Verdict, judge
+from wholearm_jax.verdict import ARRIVAL, GOALS, Verdict, judge
 from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
 
 SLIPPING = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
@@ -136,24 +136,29 @@ def prepare(scene_body, hand, gravity, formation, rough, heading, resolution: Re
     return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), Traced(wire, reduce_wire(mechanics, wire)))
 
 
-def run(table: Table, schedule: Torque, start, duration, how: Integration, arrive: str, arriving=None) -> Outcome:
-    """Simulate one phase from its wire's start, score it and judge how it ends (`arrive`, as in `Phase`).
+def run(
+    table: Table, schedule: Torque, start, duration, how: Integration, goal, arriving=None, arrival=ARRIVAL
+) -> Outcome:
+    """Simulate one phase from its wire's start, score it and judge whether it ends as `goal` says: a word as in
+    `Phase.arrive`, or a number of `GOALS`.
 
-    `arriving` is `z_dot` (SI) at the end of the phase before, for a change of formation while moving (None: at rest).
+    `arriving` is `z_dot` (SI) at the end of the phase before, for a change of formation while moving (None: at rest);
+    `arrival` how near the wire's end the phase must come (`verdict`).
     """
     dtype = table.breaks.dtype
     arriving = jnp.asarray(np.zeros(5), dtype) if arriving is None else arriving
-    start, duration, arrival = jnp.asarray(start, dtype), jnp.asarray(duration, dtype), jnp.asarray(ARRIVALS[arrive])
-    return _run(table, schedule, start, duration, arriving, how, arrival)
+    start, duration, arrival = (jnp.asarray(a, dtype) for a in (start, duration, arrival))
+    goal = jnp.asarray(GOALS[goal] if isinstance(goal, str) else goal)
+    return _run(table, schedule, start, duration, arriving, how, goal, arrival)
 
 
 @eqx.filter_jit
-def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, arrival) -> Outcome:
+def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, goal, arrival) -> Outcome:
     seen = window(schedule, start, duration)
     entered = change(table, arriving)
     motion = move(table, seen, duration, how=how, speed=jnp.maximum(entered.speed, 0.0))
     scored = score(table, seen, duration, motion, how)
-    verdict = judge(table, motion, scored, arrival, entered)
+    verdict = judge(table, motion, scored, goal, entered, arrival)
     last = jnp.maximum(motion.count - 1, 0)
     panel, xi = powers(table, motion.piece[last], motion.s[motion.count])
     leaving = horner(table.velocity[panel], xi) * motion.w[motion.count] / duration
@@ -198,6 +203,14 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     The table of a phase is refined (panels doubled, up to 512) until its interpolation error, relative to each
     function's size, is below `tolerance`; pieces are added likewise. What cannot be traced says so in
     `Traced.table.status`, and what follows it cannot be trusted.
+
+    The paper's "set of C-functions equated to zero", solved along the whole wire (derivation, section 3).
+
+    >>> traced = wa.trace(wa.load("heptagon"))
+    >>> [wa.Status(int(one.table.status)).label for one in traced]
+    ['ok', 'ok']
+    >>> print(f"{float(traced[0].table.length):.2f} object radii")
+    1.33 object radii
     """
     solid, rough, found = body(scene.object), scene.start, []
     for phase in scene.phases:
@@ -205,13 +218,13 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
         if phase.arrive == "hold" and _concrete(traced.table.status) and int(traced.table.status) != Status.OK:
             other = eqx.tree_at(lambda p: p.heading.sign, phase, -phase.heading.sign)
             traced = _refined(solid, scene, other, rough, resolution, tolerance)
-        found.append(_joined(traced, rough) if found else traced)
+        found.append(joined(traced, rough) if found else traced)
         rough = destination(phase, traced)
     return tuple(found)
 
 
 @jax.jit
-def _joined(traced: Traced, rough) -> Traced:
+def joined(traced: Traced, rough) -> Traced:
     """Refuse a phase whose formation does not hold where the phase before it ended."""
     panel, xi = powers(traced.table, jnp.asarray(0), traced.table.breaks[0])
     apart = jnp.abs(horner(traced.table.configuration[panel], xi) - rough).max()
@@ -247,14 +260,16 @@ def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, toleranc
             return traced
 
 
-def outcomes(scene: Scene, torque: Torque, traced: tuple[Traced, ...], how: Integration) -> tuple[Outcome, ...]:
+def outcomes(
+    scene: Scene, torque: Torque, traced: tuple[Traced, ...], how: Integration, arrival: float = ARRIVAL
+) -> tuple[Outcome, ...]:
     """Simulate every phase; differentiable, and usable under any JAX transformation."""
     zero = jnp.zeros((), torque.times.dtype)
     schedule, start, planned, still, found = _padded(torque), zero, zero, jnp.zeros(5, zero.dtype), []
     arriving = still
     for phase, at in zip(scene.phases, traced, strict=True):
         planned = planned + phase.duration
-        one = run(at.table, schedule, start, planned - start, how, phase.arrive, arriving)
+        one = run(at.table, schedule, start, planned - start, how, phase.arrive, arriving, arrival)
         found.append(one)
         flying = phase.arrive == "moving"
         start = start + one.duration * one.motion.share[one.motion.count] if flying else planned
@@ -275,32 +290,58 @@ def margin(
     Differentiable, in forward and reverse mode, with respect to the torques and every float of the scene; negative
     where a contact would pull; `-inf` where a phase has no motion to score. Whether the plan succeeds is for
     `simulate` to say. Phases that hold the object do not count.
+
+    The forces are those of the paper's section 2.2, its `c_n > 0` (derivation, sections 4 and 7). Needs float64:
+    without, wires cannot be traced and the margin is `-inf`.
+
+    >>> scene = wa.load("heptagon")
+    >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")
+    0.70 N
     """
     found = outcomes(scene, torque, trace(scene, resolution=resolution), how)
     moving = [o.score.margin for o, p in zip(found, scene.phases, strict=True) if p.arrive != "hold"]
     return jnp.stack([jnp.where(jnp.isfinite(m), m, -jnp.inf) for m in moving]).min()
 
 
+def require_covered(scenes: Scene, torque: Torque) -> None:
+    """Raise ValueError for a schedule that is shorter than the plan, or than the longest plan of stacked scenes."""
+    total = float(np.max(sum(np.asarray(p.duration) for p in scenes.phases)))
+    first, last = float(torque.times[0]), float(torque.times[-1])
+    if first > 0 or last < total * (1 - 1e-9):
+        raise ValueError(f"the torque schedule covers {first:g} to {last:g} s, the plan 0 to {total:g} s")
+
+
 def simulate(
-    scene: Scene, torque: Torque, *, tolerance: float = 1e-10, max_steps: int = 256, traced: tuple[Traced, ...] = ()
+    scene: Scene,
+    torque: Torque,
+    *,
+    tolerance: float = 1e-10,
+    max_steps: int = 256,
+    traced: tuple[Traced, ...] = (),
+    arrival: float = ARRIVAL,
 ) -> Result:
     """Simulate a plan under a torque schedule and judge it.
 
-    `tolerance` is the integrator's; `traced` reuses the result of `trace`. Raises ValueError for a schedule that is
-    shorter than the plan; everything else is a status.
+    `tolerance` is the integrator's; `traced` reuses the result of `trace`; `arrival` is how near its wire's end a phase
+    must come, as a share of the wire's length. Raises ValueError for a schedule that is shorter than the plan;
+    everything else is a status.
+
+    Integrates the paper's eq. (16) (derivation, section 6). Raises RuntimeError without float64.
+
+    >>> scene = wa.load("heptagon")
+    >>> result = wa.simulate(scene, wa.torque([0.0, 2.0], [[0.0, 0.0], [0.0, 0.0]]))
+    >>> result.status.label, result.phases[0].status.label
+    ('stuck', 'stuck')
+    >>> print(result.message)
+    slide left: stuck, t = 1 s: friction holds the object at rest; raise the torque that pushes it, or lower the squeeze
     """
     require_x64()
-    total = sum(float(p.duration) for p in scene.phases)
-    last = float(torque.times[-1])
-    if float(torque.times[0]) > 0 or last < total * (1 - 1e-9):
-        raise ValueError(
-            f"the torque schedule covers {float(torque.times[0]):g} to {last:g} s, the plan 0 to {total:g} s"
-        )
+    require_covered(scene, torque)
     traced = traced or trace(scene)
     stepped = any(has_steps(torque, start, end) for start, end in _spans(scene))
     while True:
         how = Integration(tolerance=tolerance, max_steps=max_steps, stages=max(8, max_steps // 32), steps=stepped)
-        found = outcomes(scene, torque, traced, how)
+        found = outcomes(scene, torque, traced, how, arrival)
         short = any(int(o.verdict.status) == Status.MAX_STEPS for o in found)
         if not short or max_steps >= 16384:
             return describe(scene, torque, traced, found)
@@ -438,7 +479,16 @@ def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shar
 
 
 def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
-    """Every phase at `samples` evenly spaced times; a phase that failed stops there, and later ones are left out."""
+    """Every phase at `samples` evenly spaced times; a phase that failed stops there, and later ones are left out.
+
+    A tuple of `Trajectory`, one a phase: `time` `(samples,)` [s], `z` and `z_dot` `(samples, 5)`, `cn` and `ct`
+    `(samples, 4)` [N].
+
+    >>> scene = wa.load("heptagon")
+    >>> first, *_ = wa.trajectory(wa.simulate(scene, wa.quasistatic(scene)), samples=5)
+    >>> [f"{t:.2f}" for t in first.time.tolist()], first.cn.shape
+    (['0.00', '0.25', '0.50', '0.75', '1.00'], (5, 4))
+    """
     found, schedule, rows = [], _padded(result.torque), -(-samples // SAMPLED) * SAMPLED
     for phase in result.phases:
         if int(phase.traced.table.status) != Status.OK:

@@ -8,6 +8,8 @@ at each `s` one 5x5 linear system gives everything (the paper's eqs. 1-4 and 12-
 A contact that rolls has no friction law, `Xi = 0`, but a column `-G_t^T` with its tangential force `c_t` as unknown.
 The answer is linear in `(1, v^2, v, tau1, tau2)`. For forward travel the coefficients are functions of `s` alone, here
 tabulated as one polynomial a panel of the wire.
+
+Derivation: section 4 of `docs/derivation.md`.
 """
 
 import equinox as eqx

@@ -32,7 +32,14 @@ TRAJECTORY_COLUMNS = (
 
 
 def read_torque(path: str | Path) -> Torque:
-    """Read a torque schedule (header `t,tau1,tau2`). Raises `SceneError` naming the file, the line and the cause."""
+    """Read a torque schedule (header `t,tau1,tau2`; s, N m).
+
+    Raises `SceneError` naming the file, the line and the cause.
+
+    >>> wa.write_torque(wa.torque([0.0, 2.0], [[0.5, -0.2], [0.5, -0.4]]), folder / "torque.csv")
+    >>> wa.read_torque(folder / "torque.csv").values.tolist()
+    [[0.5, -0.2], [0.5, -0.4]]
+    """
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             rows = list(csv.reader(file))
@@ -71,7 +78,14 @@ def read_torque(path: str | Path) -> Torque:
 
 
 def write_torque(schedule: Torque, path: str | Path) -> None:
-    """Write a torque schedule with every digit."""
+    """Write a torque schedule (header `t,tau1,tau2`; s, N m) with every digit. Raises `OSError`.
+
+    >>> wa.write_torque(wa.torque([0.0, 2.0], [[0.5, -0.2], [0.5, -0.4]]), folder / "torque.csv")
+    >>> print((folder / "torque.csv").read_text(), end="")
+    t,tau1,tau2
+    0.0,0.5,-0.2
+    2.0,0.5,-0.4
+    """
     table = np.column_stack([np.asarray(schedule.times), np.asarray(schedule.values)])
     write_whole(path, _csv(TORQUE_COLUMNS, table.tolist()))
 

@@ -124,7 +124,15 @@ class Phase(eqx.Module):
 
 
 class Scene(eqx.Module):
-    """A hand, an object, a rough start and a plan; every float in it can be differentiated with respect to."""
+    """A hand, an object, a rough start and a plan; every float in it can be differentiated with respect to.
+
+    `gravity` `(2,)` [m/s^2], `start` `(x, y, phi, theta1, theta2)` [m, rad]. Immutable; copies are made with equinox:
+
+    >>> import equinox as eqx
+    >>> scene = wa.load("heptagon")
+    >>> eqx.tree_at(lambda s: s.object.friction, scene, 1.2 * scene.object.friction).object.friction.tolist()
+    [0.12, 0.12, 0.12]
+    """
 
     title: str = eqx.field(static=True)
     gravity: Float[Array, "2"]

@@ -216,7 +216,17 @@ def bundled() -> tuple[str, ...]:
 
 
 def load(name: str | Path) -> Scene:
-    """Read a scene: a bundled one by name (`"heptagon"`), any other by path. Raises `SceneError`."""
+    """Read a scene: a bundled one by name (`"heptagon"`), any other by path. Lengths in m, masses in kg, SI throughout.
+
+    Raises `SceneError` with one line that names the file, the key and what is wrong.
+
+    >>> scene = wa.load("heptagon")
+    >>> [phase.name for phase in scene.phases]
+    ['slide left', 'flip right']
+    >>> wa.load("heptagn")
+    Traceback (most recent call last):
+    wholearm_jax.scene_file.SceneError: heptagn: no such file; did you mean the bundled scene 'heptagon'?
+    """
     if str(name) in bundled():
         text = (resources.files("wholearm_jax") / "scenes" / f"{name}.toml").read_text("utf-8")
         return parse(tomllib.loads(text), str(name))
@@ -235,7 +245,18 @@ def load(name: str | Path) -> Scene:
 
 
 def parse(data: dict[str, Any], source: str = "scene") -> Scene:
-    """A scene from nested dictionaries, as TOML gives them. Raises `SceneError`."""
+    """A scene from nested dictionaries, as TOML gives them. Raises `SceneError`; `source` begins its message.
+
+    >>> from wholearm_jax.scene_file import to_dict
+    >>> data = to_dict(wa.load("heptagon"))
+    >>> data["object"]["mass"] = 0.3
+    >>> float(wa.parse(data).object.mass)
+    0.3
+    >>> data["object"]["mass"] = -1.0
+    >>> wa.parse(data, source="mine")
+    Traceback (most recent call last):
+    wholearm_jax.scene_file.SceneError: mine: object.mass: must be greater than 0, not -1.0
+    """
     try:
         checked = _Scene.model_validate(data)
     except ValidationError as error:
@@ -343,5 +364,10 @@ def _phase_dict(phase: Phase) -> dict[str, Any]:
 
 
 def save(scene: Scene, path: str | Path) -> None:
-    """Write a scene as TOML, whole or not at all."""
+    """Write a scene as TOML, whole or not at all; `load` reads it back with every digit. Raises `OSError`.
+
+    >>> wa.save(wa.load("hexagon"), folder / "mine.toml")
+    >>> wa.load(folder / "mine.toml").title
+    'hexagon'
+    """
     write_whole(path, tomli_w.dumps(to_dict(scene)))

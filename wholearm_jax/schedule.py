@@ -31,7 +31,16 @@ class Window(eqx.Module):
 
 
 def torque(times, values) -> Torque:
-    """Build a schedule, checked: at least two rows, finite, times sorted, no time more than twice."""
+    """Build a schedule from `times` `(rows,)` [s] and `values` `(rows, 2)` [N m], linear in between.
+
+    Raises `ValueError` unless there are at least two rows, all finite, with times sorted and none more than twice.
+
+    >>> wa.torque([0.0, 1.0], [[0.5, -0.2], [0.5, -0.4]]).values.shape
+    (2, 2)
+    >>> wa.torque([1.0, 0.0], [[0.5, -0.2], [0.5, -0.4]])
+    Traceback (most recent call last):
+    ValueError: times must not decrease, and none may stand more than twice
+    """
     times, values = jnp.asarray(times, float), jnp.asarray(values, float)
     clock = np.asarray(times)
     if clock.ndim != 1 or clock.size < 2 or values.shape != (clock.size, 2):

@@ -12,6 +12,8 @@ end: the forces continue smoothly there, and only an honest simulation (`motion`
 
 Source of the method: H. G. Bock and K. J. Plitt, A multiple shooting algorithm for direct solution of optimal control
 problems, IFAC World Congress 1984.
+
+Derivation: section 9 of `docs/derivation.md`.
 """
 
 from typing import NamedTuple

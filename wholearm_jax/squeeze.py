@@ -4,6 +4,8 @@ For a given motion the equation of motion `A3 tau1 + A4 tau2 = a - A0 - A1 v^2 -
 torques, the squeeze. Along it each force is linear, so the best least force lies where two forces meet or at a limit.
 The bound lets the acceleration go free as well; its optimum is a vertex of a linear programme in `(tau1, tau2, m)`.
 Of a contact that rolls, three linear functions of the torque count: `c_n`, `mu c_n - c_t` and `mu c_n + c_t`.
+
+Derivation: section 8 of `docs/derivation.md`.
 """
 
 import itertools

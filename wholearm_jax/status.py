@@ -6,7 +6,11 @@ import enum
 class Status(enum.IntEnum):
     """Outcome of a trace, a simulated phase or a whole plan.
 
-    The numeric values travel through compiled programs and batches; `name` (lower case) is what the files print.
+    The numeric values travel through compiled programs and batches; `label` is what the files print. The page
+    `docs/statuses.md` has them all.
+
+    >>> wa.Status.STUCK.label, wa.Status.STUCK.advice.partition(";")[0]
+    ('stuck', 'friction holds the object at rest')
     """
 
     OK = 0

@@ -2,6 +2,8 @@
 
 Length unit: the largest distance of a vertex from the centre of mass. Mass unit: the object's mass. Time stays in
 seconds. Angles and `z = (x, y, phi, theta1, theta2)` are then all of order one.
+
+Derivation: section 2 of `docs/derivation.md`.
 """
 
 import equinox as eqx

@@ -1,7 +1,5 @@
 """Judge: what became of a simulated phase, from its motion and its score."""
 
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -12,12 +10,12 @@ from wholearm_jax.reduction import Change, Table
 from wholearm_jax.status import Status
 
 ARRIVAL = 1e-6  # of the wire's length: how near its end a phase that arrives at rest must come
-ARRIVAL_SPEED = math.sqrt(12 * ARRIVAL)
-"""Speed left at arrival, in wire lengths a duration: what braking at 6 lengths a duration squared (the even
-rest-to-rest motion) ends within `ARRIVAL` of a length. Nearer to the end time and position do not fix the speed better
-than this square root."""
+BRAKING = 12.0
+"""The speed left at arrival within a share `a` of the wire is at most `sqrt(BRAKING a)` wire lengths a duration: what
+braking at 6 lengths a duration squared (the even rest-to-rest motion) ends within `a` of a length. Nearer to the end
+time and position do not fix the speed better than this square root."""
 
-ARRIVALS = {"moving": 0, "caught": 0, "rest": 1, "hold": 2}
+GOALS = {"moving": 0, "caught": 0, "rest": 1, "hold": 2}
 """How a phase must end, as a number that compiled programs take: at any speed, at rest, where it began."""
 
 PULL = 1e-9  # share of `Change.size` by which an impulse may be negative for rounding
@@ -31,18 +29,27 @@ class Verdict(eqx.Module):
     contact: Int[Array, ""]
 
 
-def judge(table: Table, motion: Motion, score: Score, arrival: Int[Array, ""], entered: Change) -> Verdict:
-    """Decide the status of a phase that must end as `arrival` says (one of `ARRIVALS`).
+def judge(
+    table: Table,
+    motion: Motion,
+    score: Score,
+    goal: Int[Array, ""],
+    entered: Change,
+    arrival: float | Float[Array, ""] = ARRIVAL,
+) -> Verdict:
+    """Decide the status of a phase that must end as `goal` says (one of `GOALS`), within a share `arrival` of its
+    wire's length.
 
     The earliest trouble counts: a wire that cannot be traced, an impulse that would pull (or throw the object back)
     where the phase is entered with speed, a tensile force, then how the motion ended. A phase that holds the object
     fails when it departs: `reversed` backward, `not_reached` forward along the way that its wire was traced.
     """
-    at_rest, holds = arrival == ARRIVALS["rest"], arrival == ARRIVALS["hold"]
+    at_rest, holds = goal == GOALS["rest"], goal == GOALS["hold"]
     share, s, w = (values[motion.count] for values in (motion.share, motion.s, motion.w))
-    near = jnp.abs(table.breaks[-1] - s) <= ARRIVAL * table.length
-    slow = w <= ARRIVAL_SPEED * table.length
-    late = share >= 1 - ARRIVAL_SPEED
+    speed = jnp.sqrt(BRAKING * jnp.asarray(arrival, s.dtype))
+    near = jnp.abs(table.breaks[-1] - s) <= arrival * table.length
+    slow = w <= speed * table.length
+    late = share >= 1 - speed
     ended = motion.status
     there = (ended == Status.LEFT_FORMATION) | (ended == Status.OK)
     held = (ended == Status.STUCK) | ((ended == Status.REVERSED) & late)

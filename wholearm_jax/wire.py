@@ -9,6 +9,8 @@ in five unknowns, from which derivatives follow (`newton`).
 
 A wire is cut into *pieces* where a contact's slip or a joint's speed reverses, or the chart changes: within a piece
 everything is smooth. Pieces are cut into panels with Chebyshev nodes, at which `reduction` tabulates.
+
+Derivation: section 3 of `docs/derivation.md`.
 """
 
 from typing import NamedTuple

@@ -1,0 +1,142 @@
+"""What a new process costs: from its start to the first result, with nothing compiled before and with programs kept.
+
+    python benchmarks/cold_start.py [--repeats N]
+
+Each run is a process of its own, as a user starts it. With an empty cache folder everything is compiled; the second
+run finds the first one's programs there. `apart` splits one more process of each kind by what JAX itself reports:
+importing, tracing Python into programs and lowering them (threads overlap, so that parts may sum to more than the
+whole), compiling, reading kept programs, and the rest (figures, files, the computation). `plain` compiles as XLA does
+by default, without the command line's choice of emitters.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import measure
+
+COMMANDS = {
+    "optimise": ("optimise", "heptagon"),
+    "search": ("search", "heptagon"),
+    "simulate": ("simulate", "heptagon"),
+}
+PLAIN = "--xla_cpu_use_fusion_emitters=true"
+PARTS = ("import", "trace", "lower", "compile", "read kept programs")
+COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#D55E00", "#CC79A7")
+
+APART = """
+import json, sys, time
+begun = time.perf_counter()
+import jax
+from wholearm_jax.command import main
+import wholearm_jax
+spent = {"import": time.perf_counter() - begun}
+names = {
+    "/jax/core/compile/jaxpr_trace_duration": "trace",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration": "lower",
+    "/jax/core/compile/backend_compile_duration": "compile",
+    "/jax/compilation_cache/cache_retrieval_time_sec": "read kept programs",
+}
+def listen(event, seconds, **_):
+    if event in names:
+        spent[names[event]] = spent.get(names[event], 0.0) + seconds
+jax.monitoring.register_event_duration_secs_listener(listen)
+sys.argv = ["wholearm", *sys.argv[1:]]
+try:
+    main()
+except SystemExit:
+    pass
+# What is read from the cache is reported as compiled, too.
+spent["compile"] = spent.get("compile", 0.0) - spent.get("read kept programs", 0.0)
+spent["whole"] = time.perf_counter() - begun
+print(json.dumps(spent))
+"""
+
+
+def environment(cache: Path, flags: str = "") -> dict[str, str]:
+    """A user's environment: the command line's own cache, in a folder of its own."""
+    mine = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_", "OPENBLAS_"))}
+    return mine | {"XDG_CACHE_HOME": str(cache)} | ({"XLA_FLAGS": flags} if flags else {})
+
+
+def run(arguments, cache: Path, out: Path, flags: str = "") -> float:
+    """Wall time [s] of one process."""
+    begun = time.perf_counter()
+    command = [sys.executable, "-m", "wholearm_jax.command", *arguments, "--out", str(out)]
+    done = subprocess.run(command, env=environment(cache, flags), capture_output=True, text=True)
+    if done.returncode == 2:
+        raise RuntimeError(done.stderr)
+    return time.perf_counter() - begun
+
+
+def apart(arguments, cache: Path, out: Path) -> dict[str, float]:
+    """Where one process's time goes [s]."""
+    command = [sys.executable, "-c", APART, *arguments, "--out", str(out)]
+    done = subprocess.run(command, env=environment(cache), capture_output=True, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def measured(name: str, arguments, repeats: int, torque: Path) -> dict:
+    """Cold and kept times of one command, in turn."""
+    arguments = (*arguments, "--torque", str(torque)) if name == "simulate" else arguments
+    cold, kept, plain = [], [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for k in range(repeats):
+            cache, out = Path(folder, f"cache{k}"), Path(folder, "out")
+            cold.append(run(arguments, cache, out))
+            kept.append(run(arguments, cache, out))
+            plain.append(run(arguments, Path(folder, f"plain{k}"), out, PLAIN))
+        fresh = Path(folder, "apart")
+        parts = {"cold": apart(arguments, fresh, out), "kept": apart(arguments, fresh, out)}
+    medians = {"cold": statistics.median(cold), "kept": statistics.median(kept), "plain": statistics.median(plain)}
+    return {"seconds": medians, "runs": {"cold": cold, "kept": kept, "plain": plain}, "apart": parts}
+
+
+def draw(found: dict, path: Path) -> None:
+    """Bars: the parts of every process."""
+    plt.rcParams |= {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
+    figure, ax = plt.subplots(figsize=(6.4, 0.5 + 0.5 * 2 * len(found)), layout="constrained")
+    labels = []
+    for name, result in found.items():
+        for kind in ("cold", "kept"):
+            left, parts = 0.0, result["apart"][kind]
+            for part, colour in zip(PARTS, COLOURS, strict=True):
+                width = parts.get(part, 0.0)
+                ax.barh(len(labels), width, left=left, color=colour, label=part if not labels else None)
+                left += width
+            ax.plot(result["seconds"][kind], len(labels), "|", color="#222222", ms=14, mew=2)
+            labels.append(f"{name}, {kind}")
+    ax.set_yticks(range(len(labels)), labels)
+    ax.invert_yaxis()
+    ax.set_xlabel("time [s]: parts, which overlap; the stroke is the whole process from start to exit")
+    ax.legend(frameon=False, loc="lower right")
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Measure, save, draw, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=3)
+    repeats = parser.parse_args().repeats
+    with tempfile.TemporaryDirectory() as folder:
+        run(COMMANDS["optimise"], Path(folder, "cache"), Path(folder, "out"))
+        torque = Path(folder, "out", "torque.csv")
+        found = {name: measured(name, command, repeats, torque) for name, command in COMMANDS.items()}
+    path = measure.save("cold_start", found)
+    draw(found, path.with_suffix(".svg"))
+    for name, result in found.items():
+        print(f"{name}: " + ", ".join(f"{kind} {value:.1f} s" for kind, value in result["seconds"].items()))
+        for kind, parts in result["apart"].items():
+            print(f"  {kind}: " + ", ".join(f"{part} {value:.1f}" for part, value in parts.items()))
+
+
+if __name__ == "__main__":
+    main()

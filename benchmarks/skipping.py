@@ -1,0 +1,161 @@
+r"""What each thing that a scene or a question does not need costs: the same work with it over the work without it.
+
+    python benchmarks/skipping.py [--quick]
+
+On the heptagon's slide and flip under the piecewise-linear torques, warm and in turn. Rows are of two kinds: what the
+package leaves out by itself (it is part of another call), and what it could leave out, tried here. A row near 1 does
+not pay and is not in the package.
+"""
+
+import argparse
+from functools import partial
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import measure
+import numpy as np
+from work_precision import problems
+
+import wholearm_jax as wa
+from wholearm_jax import plan
+from wholearm_jax.forces import force, score
+from wholearm_jax.motion import move
+from wholearm_jax.reduction import horner, powers
+from wholearm_jax.scene import body
+from wholearm_jax.schedule import interval, torque_in
+from wholearm_jax.wire import Resolution
+
+jax.config.update("jax_enable_x64", True)
+
+COARSE = Resolution(6, 16, 8)
+
+
+@partial(jax.jit, static_argnames="adjoint")
+def moved(table, seen, duration, adjoint="none"):
+    """The motion alone."""
+    return move(table, seen, duration, how=wa.Integration(adjoint=adjoint))
+
+
+@jax.jit
+def scored(table, seen, duration):
+    """The motion and its margin."""
+    how = wa.Integration()
+    return score(table, seen, duration, move(table, seen, duration, how=how), how)
+
+
+@partial(jax.jit, static_argnames=("terms", "stop"))
+def bare(table, seen, duration, terms=(0, 1, 2, 3, 4), stop=False):
+    """One stage on the wire's first piece with only some of the terms `(1, v^2, v, tau1, tau2)`; `stop` looks for the
+    first tensile force at every step's end."""
+
+    def coefficients(piece, s):
+        panel, xi = powers(table, piece, s)
+        values = horner(table.acceleration[panel], xi)
+        return [values[k] for k in terms]
+
+    def field(u, y, _):
+        tau = torque_in(seen, interval(seen, u), u)
+        v = y[1] / duration
+        one = jnp.ones_like(v)
+        inputs = [one, v**2, v, *tau]
+        pull = sum(a * inputs[k] for a, k in zip(coefficients(0, y[0]), terms, strict=True))
+        return jnp.stack([y[1], duration**2 * pull])
+
+    def ended(t, y, args, **_):
+        over = y[0] > table.breaks[1]
+        if stop:
+            row = interval(seen, t)
+            over = over | (force(table, seen, duration, 0, row, t, y[0], y[1]).min() < 0)
+        return over
+
+    errors = dfx.PIDController(rtol=1e-10, atol=1e-10)
+    return dfx.diffeqsolve(
+        dfx.ODETerm(field),
+        dfx.Dopri8(),
+        0.0,
+        1.0,
+        1 / 32,
+        jnp.stack([table.breaks[0], jnp.zeros(())]),
+        saveat=dfx.SaveAt(steps=True),
+        stepsize_controller=dfx.ClipStepSizeController(errors, step_ts=seen.share),
+        event=dfx.Event(ended),
+        adjoint=dfx.DirectAdjoint(),
+        max_steps=256,
+        throw=False,
+    ).ys
+
+
+def rows(problem, repeats: int) -> list[dict]:
+    """Every comparison on one phase: times of both sides [s] and their ratio."""
+    table, seen, duration = problem.traced.table, problem.seen, problem.duration
+    scene, phase = problem.scene, problem.scene.phases[problem.phase]
+    rough = plan.end_configuration(wa.trace(scene)[problem.phase - 1]) if problem.phase else scene.start
+    solid = body(scene.object)
+
+    def prepared(resolution):
+        return plan.prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, resolution)
+
+    shares = np.linspace(0.0, 1.0, plan.SAMPLED)
+    motion = moved(table, seen, duration)
+    gradient = jax.jit(jax.value_and_grad(lambda v: _margin(table, seen, duration, v)))
+    calls = {
+        "tracing, when the wire is known": (lambda: (prepared(Resolution()), scored(table, seen, duration)), "margin"),
+        "a table of 64 panels, when 16 would do": (lambda: prepared(Resolution()), lambda: prepared(COARSE)),
+        "the margin, when the motion is asked": (lambda: scored(table, seen, duration), "move"),
+        "the trajectory, when the margin is asked": (
+            lambda: (
+                scored(table, seen, duration),
+                plan.sample(table, problem.schedule, problem.start, duration, motion, shares),
+            ),
+            "margin",
+        ),
+        "the gradient, when the margin is asked": (lambda: gradient(seen.values), "margin"),
+        "repeatable steps, when no reverse mode is asked": (lambda: moved(table, seen, duration, "both"), "move"),
+        "the viscous term, when nothing is viscous": (
+            lambda: bare(table, seen, duration),
+            lambda: bare(table, seen, duration, terms=(0, 1, 3, 4)),
+        ),
+        "the term in v^2, on a straight wire": (
+            lambda: bare(table, seen, duration),
+            lambda: bare(table, seen, duration, terms=(0, 2, 3, 4)),
+        ),
+        "looking for a tensile force at every step": (
+            lambda: bare(table, seen, duration, stop=True),
+            lambda: bare(table, seen, duration),
+        ),
+    }
+    base = {"margin": lambda: scored(table, seen, duration), "move": lambda: moved(table, seen, duration)}
+    found = []
+    for name, (with_it, without) in calls.items():
+        without = base[without] if isinstance(without, str) else without
+        times = measure.compare({"with": with_it, "without": without}, repeats=repeats)
+        found.append({"what": name, **times, "ratio": times["with"] / times["without"]})
+    return found
+
+
+def _margin(table, seen, duration, values):
+    how = wa.Integration(adjoint="both")
+    slope = jnp.diff(values, axis=0) / jnp.where(jnp.diff(seen.share) > 0, jnp.diff(seen.share), 1.0)[:, None]
+    changed = eqx.tree_at(lambda w: (w.values, w.slope), seen, (values, slope))
+    return score(table, changed, duration, move(table, changed, duration, how=how), how).margin
+
+
+def main() -> None:
+    """Measure, save, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="fewer repeats")
+    repeats = 3 if parser.parse_args().quick else 9
+    found = {}
+    for problem in problems(referred=False)[::2]:
+        found[problem.name] = rows(problem, repeats)
+        print(f"\n{problem.name}: time with over time without")
+        for row in found[problem.name]:
+            times = f"{1e3 * row['with']:.3f} against {1e3 * row['without']:.3f} ms"
+            print(f"  {row['what']:50s}{row['ratio']:8.2f}   ({times})")
+    measure.save("skipping", found)
+
+
+if __name__ == "__main__":
+    main()

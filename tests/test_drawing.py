@@ -1,0 +1,75 @@
+"""Figures: drawn on the axes given or on new ones, returned, with what the result says; a paper's settings."""
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from wholearm_jax.drawing import COLUMN, PAPER, draw_forces, draw_pose, draw_result, draw_strip, draw_torques
+from wholearm_jax.palette import CONTACT_COLOURS, DASHES, contact_styles
+from wholearm_jax.plan import simulate
+from wholearm_jax.scene_file import load, parse, to_dict
+from wholearm_jax.schedule import torque
+
+mpl.use("agg")
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    """The heptagon pushed to the left under constant torques."""
+    data = to_dict(load("heptagon"))
+    data["phase"] = [data["phase"][0] | {"arrive": "caught", "duration": 0.3}]
+    return simulate(parse(data), torque([0.0, 0.3], [[0.55, -0.24]] * 2))
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+@pytest.mark.parametrize("draw", [draw_torques, draw_forces])
+def test_draws_on_the_axes_given(draw, pushed):
+    _, (used, other) = plt.subplots(1, 2)
+    assert draw(pushed, used) is used
+    assert used.lines
+    assert not other.lines
+    assert draw(pushed) is plt.gca()
+
+
+def test_results_compose(pushed):
+    figure, grid = plt.subplots(2, 2)
+    assert list(draw_result(pushed, grid[:, 0])) == list(grid[:, 0])
+    assert list(draw_strip(pushed, axes=grid[:, 1:].T)[0]) == list(grid[:, 1])
+    assert len(grid[1, 1].patches) == 1  # the object
+    assert figure.axes == list(grid.flat)  # none was added
+
+
+def test_forces_show_the_margin_and_every_contact(pushed):
+    ax = draw_forces(pushed)
+    legend = ax.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == list(pushed.phases[0].contacts)
+    (dot,) = (line for line in ax.lines if line.get_marker() == "o")
+    np.testing.assert_allclose(dot.get_xydata()[0], (pushed.phases[0].margin_time, pushed.margin))
+    assert any(f"margin {pushed.margin:.3g} N" in text.get_text() for text in ax.texts)
+
+
+def test_pose_numbers_its_vertices(pushed):
+    ax = draw_pose(pushed.scene, pushed.scene.start, numbers=True)
+    assert [text.get_text() for text in ax.texts] == [str(k) for k in range(7)]
+
+
+def test_settings_of_a_paper(pushed):
+    with plt.rc_context(PAPER):
+        figure = draw_result(pushed)[0].figure
+        assert mpl.rcParams["font.size"] == 8
+        assert mpl.rcParams["pdf.fonttype"] == 42
+    assert figure.get_size_inches()[0] == COLUMN
+
+
+def test_contacts_are_told_apart():
+    several = [[f"palm:v{k}" for k in range(4)], [f"finger1:v{k}" for k in range(8)]]
+    styles = contact_styles(several)
+    assert len(set(styles.values())) == len(styles) == 12
+    assert all(colour < len(CONTACT_COLOURS) and dash < len(DASHES) for colour, dash in styles.values())

@@ -1,0 +1,314 @@
+"""Check: one torque schedule against very many scenes, each traced, reduced, simulated, scored and judged.
+
+The plan of one scene is a scan over its phases; `jax.vmap` makes it a block of scenes, and where there are several
+devices `shard_map` gives each its own block, with loops of its own. A chunk is a number of blocks. The first pass is
+coarse (`QUICK`): few panels, fewer steps. It knows its error; scenes for which that is too large, or which ran out of
+steps, are packed together and done again at full resolution (`FULL`), and what is left then alone, by `plan.simulate`.
+So neither the slowest scene nor one that cannot be followed holds up the others or touches their results.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int
+
+from wholearm_jax.motion import Integration
+from wholearm_jax.plan import (
+    Outcome,
+    Result,
+    Traced,
+    end_configuration,
+    joined,
+    prepare,
+    require_covered,
+    require_x64,
+    run,
+    simulate,
+)
+from wholearm_jax.reduction import horner, powers
+from wholearm_jax.scene import Formation, Heading, Scene, body
+from wholearm_jax.schedule import Torque, padded
+from wholearm_jax.status import Status
+from wholearm_jax.variation import Ensemble, stack
+from wholearm_jax.verdict import ARRIVAL, GOALS
+from wholearm_jax.wire import Resolution
+
+BLOCK = 128  # scenes that one device takes at once
+CHUNK = 4096  # scenes whose results are kept together
+EXACT = 1e-9  # tolerances below this begin at the full resolution
+
+
+class Checked(NamedTuple):
+    """What became of scenes; leading axes run over them.
+
+    `status` are `Status` values: that of the first phase that is not ok. `margin` [N] is the least over the plan, minus
+    infinity where a phase has no motion to score. `phase`, `contact` (a row of the phase's `Formation.names`, -1:
+    none) and `time` [s] say where it failed, or where the margin is where it did not. `end` is `z` (SI) where the
+    motion of the failed or last phase ended, NaN where that phase has no wire.
+    """
+
+    status: Int[Array | np.ndarray, "*scenes"]
+    margin: Float[Array | np.ndarray, "*scenes"]
+    time: Float[Array | np.ndarray, "*scenes"]
+    contact: Int[Array | np.ndarray, "*scenes"]
+    phase: Int[Array | np.ndarray, "*scenes"]
+    end: Float[Array | np.ndarray, "*scenes 5"]
+
+
+class Level(NamedTuple):
+    """How finely to compute, and the table error up to which the result counts."""
+
+    resolution: Resolution
+    how: Integration
+    error: float
+
+
+QUICK = Level(Resolution(6, 16, 8), Integration(tolerance=1e-8, max_steps=128, stages=6), 1e-7)
+FULL = Level(Resolution(), Integration(), 1e-9)
+
+
+class Source(Protocol):
+    """What scenes come from: an `Ensemble`, or scenes that are given (`Given`)."""
+
+    def draw(self, number: Int[Array, ""]) -> Scene:
+        """Scene number `number`."""
+        ...
+
+
+class Given(eqx.Module):
+    """Scenes stacked along a leading axis (`variation.stack`)."""
+
+    scenes: Scene
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return self.scenes.object.mass.shape[0]
+
+    def draw(self, number: Int[Array, ""]) -> Scene:
+        """Scene number `number`."""
+        return jax.tree.map(lambda leaf: leaf[number], self.scenes)
+
+    def part(self, numbers: np.ndarray) -> "Given":
+        """Some of the scenes, numbered anew."""
+        return Given(jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), self.scenes))
+
+
+class _Phases(NamedTuple):
+    """The phases of a plan along a leading axis."""
+
+    formation: Formation
+    heading: Heading
+    duration: Float[Array, "phases"]
+    goal: Int[Array, "phases"]
+    moving: Bool[Array, "phases"]
+
+
+class _Stop(NamedTuple):
+    """One phase of a check."""
+
+    status: Int[Array, ""]
+    margin: Float[Array, ""]
+    margin_time: Float[Array, ""]
+    margin_contact: Int[Array, ""]
+    time: Float[Array, ""]
+    contact: Int[Array, ""]
+    end: Float[Array, "5"]
+    good: Bool[Array, ""]
+
+
+def check(
+    scenes: Ensemble | Scene | Sequence[Scene],
+    torque: Torque,
+    *,
+    count: int | None = None,
+    tolerance: float = 1e-6,
+    arrival: float = ARRIVAL,
+    chunk: int = CHUNK,
+    devices: Sequence[Any] | None = None,
+) -> Checked:
+    """Check a torque schedule against many scenes: the first `count` of an ensemble, or all that are given.
+
+    `scenes` may differ in every number, in formations and in the number of vertices (see `variation.stack`).
+    `tolerance` bounds the error of the margin [N]; below 1e-9 all is computed as by `simulate`. A phase arrives when
+    it ends within a share `arrival` of its wire's length of the end, at a speed that fits (`verdict.BRAKING`). Memory
+    is that of `chunk` scenes beside the result. Never raises for a scene that fails: that is a status. Raises
+    ValueError for a schedule shorter than a plan.
+    """
+    source = scenes if isinstance(scenes, Ensemble) else Given(scenes if isinstance(scenes, Scene) else stack(scenes))
+    if count is None:
+        if isinstance(source, Ensemble):
+            raise ValueError("an ensemble has no end: say how many of its scenes to check, with count")
+        count = source.count
+    parts = check_chunks(source, torque, count, tolerance=tolerance, arrival=arrival, chunk=chunk, devices=devices)
+    return Checked(*(np.concatenate(column) for column in zip(*(part for _, part in parts), strict=True)))
+
+
+def check_chunks(
+    source: Ensemble | Given,
+    torque: Torque,
+    count: int,
+    *,
+    tolerance: float = 1e-6,
+    arrival: float = ARRIVAL,
+    chunk: int = CHUNK,
+    devices: Sequence[Any] | None = None,
+    wanted: Sequence[int] | None = None,
+) -> Iterator[tuple[int, Checked]]:
+    """`check` one chunk after the other: numbers of chunks (those `wanted`, by default all) with their results."""
+    require_x64()
+    nominal = source.scene if isinstance(source, Ensemble) else source.scenes
+    if any(phase.arrive == "hold" for phase in nominal.phases):
+        raise ValueError("phases that hold the object need linear programmes, which checks of many scenes leave out")
+    require_covered(nominal, torque)
+    mesh = Mesh(np.asarray(devices or jax.local_devices()), ("scenes",))
+    levels = (QUICK, FULL) if tolerance >= EXACT else (FULL,)
+    for number in range(-(-count // chunk)) if wanted is None else wanted:
+        rows = np.arange(number * chunk, min(count, (number + 1) * chunk))
+        yield number, _check_rows(source, rows, torque, jnp.asarray(arrival), levels, mesh)
+
+
+def _check_rows(source, rows, torque: Torque, arrival, levels, mesh) -> Checked:
+    """Check some scenes, level by level; those of the last that are not good, alone."""
+    schedule, steps = padded(torque), bool(np.any(np.diff(np.asarray(torque.times)) == 0))
+    found, left = None, np.arange(len(rows))
+    for level in levels:
+        level = level._replace(how=replace(level.how, steps=steps))
+        answer, good = _check_packed(source, rows[left], schedule, arrival, level, mesh)
+        if found is None:
+            found = answer
+        else:
+            for column, new in zip(found, answer, strict=True):
+                column[left] = new
+        left = left[~good]
+        if not len(left):
+            break
+    assert found is not None
+    for row in left:
+        alone = _check_alone(source.draw(rows[row]), torque, arrival)
+        for column, new in zip(found, alone, strict=True):
+            column[row] = new
+    return found
+
+
+def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):
+    """Check scenes block by block, the last block filled up with its last scene."""
+    size = BLOCK * mesh.size
+    filled = np.append(rows, np.repeat(rows[-1:], -len(rows) % size))
+    answers = []
+    for block in filled.reshape(-1, size):
+        few = source if isinstance(source, Ensemble) else source.part(block)
+        numbers = block if isinstance(source, Ensemble) else np.arange(size)
+        answers.append(_check_block(few, jnp.asarray(numbers), schedule, arrival, level, mesh))
+    columns = jax.tree.map(lambda *parts: np.concatenate([np.asarray(p) for p in parts])[: len(rows)], *answers)
+    return columns
+
+
+@eqx.filter_jit
+def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Level, mesh: Mesh):
+    """Check `BLOCK` scenes a device."""
+    arrays, static = eqx.partition(source, eqx.is_array)
+
+    def local(arrays, numbers, schedule, arrival):
+        from_here = eqx.combine(arrays, static)
+        return jax.vmap(lambda n: check_scene(from_here.draw(n), schedule, arrival, level))(numbers)
+
+    if mesh.size == 1:
+        return local(arrays, numbers, schedule, arrival)
+    each, whole = PartitionSpec("scenes"), PartitionSpec()
+    mapped = jax.shard_map(local, mesh=mesh, in_specs=(whole, each, whole, whole), out_specs=each, check_vma=False)
+    return mapped(arrays, numbers, schedule, arrival)
+
+
+def check_scene(scene: Scene, schedule: Torque, arrival, level: Level) -> tuple[Checked, Bool[Array, ""]]:
+    """Check one scene (under any transformation), and say whether this level's result is good enough."""
+    solid = body(scene.object)
+    phases = [
+        _Phases(p.formation, p.heading, p.duration, jnp.asarray(GOALS[p.arrive]), jnp.asarray(p.arrive == "moving"))
+        for p in scene.phases
+    ]
+    zero = jnp.zeros((), scene.start.dtype)
+
+    def one(at, phase: _Phases):
+        rough, start, planned, arriving, first = at
+        planned = planned + phase.duration
+        traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, level.resolution)
+        after = joined(traced, rough)
+        traced = jax.tree.map(lambda a, b: jnp.where(first, a, b), traced, after)
+        done = run(traced.table, schedule, start, planned - start, level.how, phase.goal, arriving, arrival)
+        stop = _stop(traced, done, phase.formation, level)
+        left = start + done.duration * done.motion.share[done.motion.count]
+        start = jnp.where(phase.moving, left, planned)
+        arriving = jnp.where(phase.moving, done.leaving, 0.0)
+        return (end_configuration(traced), start, planned, arriving, jnp.asarray(False)), stop
+
+    begin = (scene.start, zero, zero, jnp.zeros(5, zero.dtype), jnp.asarray(True))
+    _, stops = jax.lax.scan(one, begin, jax.tree.map(lambda *leaves: jnp.stack(leaves), *phases))
+    failed = stops.status != int(Status.OK)
+    where = jnp.where(failed.any(), jnp.argmax(failed), jnp.argmin(stops.margin))
+    last = jnp.where(failed.any(), where, len(phases) - 1)
+    # What follows a failure counts for nothing but the margin.
+    needed = jnp.arange(len(phases)) <= last
+    ok = ~failed.any()
+    answer = Checked(
+        status=stops.status[where],
+        margin=stops.margin.min(),
+        time=jnp.where(ok, stops.margin_time, stops.time)[where],
+        contact=jnp.where(ok, stops.margin_contact, stops.contact)[where],
+        phase=where,
+        end=stops.end[last],
+    )
+    return answer, jnp.all(stops.good | ~needed)
+
+
+def _stop(traced: Traced, done: Outcome, formation: Formation, level: Level) -> _Stop:
+    """One phase's result, and whether it is to be trusted: a fine table, and neither steps nor pieces used up."""
+    table, motion = traced.table, done.motion
+    known = jnp.isfinite(done.score.margin) & (table.status == 0)
+    of_slot = jnp.cumsum(~formation.tangential) - 1
+    panel, xi = powers(table, motion.piece[jnp.maximum(motion.count - 1, 0)], motion.s[motion.count])
+    status, contact = done.verdict.status, done.verdict.contact
+    worth = (status != int(Status.MAX_STEPS)) & (status != int(Status.NO_CONVERGENCE))
+    fine = (table.error <= level.error) & (table.count < level.resolution.pieces)
+    return _Stop(
+        status=status,
+        margin=jnp.where(known, done.score.margin, -jnp.inf),
+        margin_time=done.start + done.duration * done.score.share,
+        margin_contact=of_slot[done.score.contact],
+        time=done.start + done.duration * done.verdict.share,
+        contact=jnp.where(contact >= 0, of_slot[contact], -1),
+        end=jnp.where(table.status == 0, horner(table.configuration[panel], xi), jnp.nan),
+        good=jnp.where(table.status == 0, fine & worth, worth),
+    )
+
+
+def _check_alone(scene: Scene, torque: Torque, arrival) -> Checked:
+    """One scene by `simulate`, which refines until all is fine."""
+    return from_result(simulate(scene, torque, arrival=float(arrival)))
+
+
+def from_result(result: Result) -> Checked:
+    """A simulated plan as one scene of a check."""
+    rows = list(result.phases)
+    failed = next((k for k, p in enumerate(rows) if p.status is not Status.OK), None)
+    where = int(np.argmin([p.margin for p in rows])) if failed is None else failed
+    last = rows[-1 if failed is None else failed]
+    p = rows[where]
+    named = p.margin_contact if failed is None else p.contact
+    table, motion = last.traced.table, last.outcome.motion
+    panel, xi = powers(table, motion.piece[jnp.maximum(motion.count - 1, 0)], motion.s[motion.count])
+    end = horner(table.configuration[panel], xi) if int(table.status) == Status.OK else jnp.full(5, jnp.nan)
+    return Checked(
+        status=np.asarray(int(result.status)),
+        margin=np.asarray(result.margin),
+        time=np.asarray(p.margin_time if failed is None else p.time),
+        contact=np.asarray(p.contacts.index(named) if named else -1),
+        phase=np.asarray(where),
+        end=np.asarray(end),
+    )

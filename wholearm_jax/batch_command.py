@@ -1,0 +1,263 @@
+"""`wholearm check`: one schedule against very many scenes, in a store that can be gone on with; and
+`wholearm optimise --robust`.
+
+Every process of a run (`--coordinator`, or SLURM's variables) takes each `--processes`-th chunk; the first one makes
+the store and tells what became of all. Several processors are put to use by as many processes.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from wholearm_jax.arguments import BadInput, SceneName, TorqueFile
+
+ARRIVAL = 0.01  # share of the wire: perturbed plans cannot end where an unperturbed one must
+Vary = Annotated[list[str] | None, typer.Option("--vary", help="QUANTITY=AMOUNT, e.g. vertices=0.0005, friction=20%.")]
+
+
+def check(
+    scene: SceneName,
+    torque: TorqueFile,
+    out: Annotated[Path, typer.Option(help="The Zarr store of results; a summary and figures stand beside it.")],
+    vary: Vary = None,
+    polygons: Annotated[Path | None, typer.Option(help="Objects to put in the scene, .npz.")] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="How many scenes to draw.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
+    arrival: Annotated[
+        float, typer.Option(min=1e-9, max=1.0, help="Arrived: this near the wire's end, as a share of its length.")
+    ] = ARRIVAL,
+    tolerance: Annotated[float, typer.Option(min=1e-12, max=1e-3, help="Error of the margin [N].")] = 1e-6,
+    chunk: Annotated[int, typer.Option(min=1, help="Scenes that are kept together.")] = 4096,
+    optimise: Annotated[bool, typer.Option("--optimise", help="Optimise the schedule of each scene.")] = False,
+    knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase, with --optimise.")] = 51,
+    coordinator: Annotated[str | None, typer.Option(help="HOST:PORT of the first of several processes.")] = None,
+    processes: Annotated[int | None, typer.Option(min=1, help="How many processes there are.")] = None,
+    process: Annotated[int | None, typer.Option(min=0, help="Which of them this is, from 0.")] = None,
+) -> None:
+    """Check a schedule against many variants of a scene; the same command goes on with a store it left unfinished."""
+    if (polygons is None) == (count is None) or (polygons is not None and vary):
+        raise BadInput("check: give either --count, with --vary QUANTITY=AMOUNT, or --polygons FILE.npz")
+    place = _join(coordinator, processes, process)
+    try:
+        import zarr  # noqa: F401
+    except ModuleNotFoundError:
+        raise BadInput("checking many scenes needs Zarr: pip install 'wholearm_jax[batch]'") from None
+    from wholearm_jax.plan import require_covered
+    from wholearm_jax.polygon_file import read_polygons
+    from wholearm_jax.result_file import read_torque
+    from wholearm_jax.scene_file import load
+    from wholearm_jax.store import StoreError, fingerprint, identity
+
+    loaded, schedule = load(scene), read_torque(torque)
+    source = read_polygons(polygons, loaded) if polygons else ensemble(loaded, vary, seed)
+    total = count if count is not None else int(source.scenes.object.mass.shape[0])  # pyright: ignore
+    try:
+        require_covered(loaded, schedule)
+    except ValueError as error:
+        raise BadInput(f"{torque}: {error}") from None
+    settings = {"arrival": arrival, "tolerance": tolerance, "optimise": knots if optimise else None, "seed": seed}
+    settings |= {"scenes": fingerprint(source), "torque": fingerprint(schedule)}
+    job = _Job(source, schedule, settings, total, min(chunk, total), optimise, knots)
+    try:
+        store = _shared_store(out, identity(total, job.chunk, **settings), job, place)
+        _fill(store, job, place)
+        place.meet("filled")
+        if place.first:
+            told = _report(store, loaded, source, out)
+            print("\n".join(told.lines))
+    except StoreError as error:
+        raise BadInput(str(error)) from None
+    sys.exit(0)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """This process among those of a run."""
+
+    number: int
+    count: int
+
+    @property
+    def first(self) -> bool:
+        return self.number == 0
+
+    def meet(self, name: str) -> None:
+        """Wait for the others."""
+        if self.count > 1:
+            from jax.experimental.multihost_utils import sync_global_devices
+
+            sync_global_devices(name)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What is to be computed."""
+
+    source: Any
+    torque: Any
+    settings: dict[str, Any]
+    count: int
+    chunk: int
+    optimise: bool
+    knots: int
+
+    @property
+    def rows(self) -> int:
+        """Rows of the schedule that each scene has for itself; 0 where all follow the given one."""
+        scene = self.source.draw(0)
+        return self.knots * len(scene.phases) if self.optimise else 0
+
+
+def optimise_robustly(varied, folder: Path | None, samples: int, knots: int, steps: int, arrival: float) -> None:
+    """`wholearm optimise --robust`: write torque.csv, say how it does on seen and unseen scenes, and exit."""
+    from wholearm_jax.result_file import write_torque
+    from wholearm_jax.robust import optimise_robustly as find
+
+    found = find(varied, samples=samples, knots=knots, steps=steps, arrival=arrival)
+    for name, (nominal, robust) in (("sampled", found.seen), ("unseen", found.unseen)):
+        told = (f"{100 * h.share:.1f} % hold, worst margin {h.margin:.4g} N" for h in (nominal, robust))
+        print(f"{samples} {name} scenes: nominal {next(told)}; robust {next(told)}")
+    if folder is not None:
+        try:
+            write_torque(found.torque, folder / "torque.csv")
+        except OSError as error:
+            raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
+    sys.exit(0 if found.unseen[1].share == 1.0 else 1)
+
+
+def ensemble(scene, amounts: list[str] | None, seed: int):
+    """The ensemble that `QUANTITY=AMOUNT` arguments describe."""
+    from wholearm_jax.variation import vary
+
+    pairs = [text.partition("=") for text in amounts or ()]
+    try:
+        return vary(scene, {name.strip(): amount.strip() for name, _, amount in pairs}, seed=seed)
+    except ValueError as error:
+        raise BadInput(f"{error}") from None
+
+
+def _join(coordinator: str | None, processes: int | None, process: int | None) -> _Place:
+    """Join the other processes of a run, if there are any."""
+    given = [value is not None for value in (coordinator, processes, process)]
+    slurm = int(os.environ.get("SLURM_NTASKS", "1")) > 1 and "SLURM_PROCID" in os.environ
+    if not any(given) and not slurm:
+        return _Place(0, 1)
+    if any(given) and not all(given):
+        raise BadInput("several processes: give all of --coordinator HOST:PORT, --processes and --process")
+    if process is not None and processes is not None and process >= processes:
+        raise BadInput(f"--process {process}: there are only {processes}, counted from 0")
+    import jax
+
+    try:
+        jax.distributed.initialize(coordinator, processes, process)
+    except (RuntimeError, ValueError) as error:
+        raise BadInput(f"--coordinator {coordinator}: {str(error).splitlines()[0]}") from None
+    return _Place(jax.process_index(), jax.process_count())
+
+
+def _shared_store(out: Path, wanted, job: _Job, place: _Place):
+    """The store; the first process makes it, the others open it then."""
+    from wholearm_jax.store import open_store
+
+    store = open_store(out, wanted, job.rows) if place.first else None
+    place.meet("store")
+    return store if store is not None else open_store(out, wanted, job.rows)
+
+
+def _fill(store, job: _Job, place: _Place) -> None:
+    """Compute and write the chunks that are missing and fall to this process."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    done = store.done()
+    missing = [k for k in range(place.number, store.chunks, place.count) if not done[k]]
+    if not missing:
+        return
+    columns = (
+        *(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}")),
+        *(TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TimeRemainingColumn()),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        total = sum(min(store.chunk, store.count - k * store.chunk) for k in missing)
+        bar, begun, written = progress.add_task("scenes", total=total, rate="compiling"), None, 0
+        for number, values in _optimised(job, missing) if job.optimise else _checked(job, missing):
+            store.write(number, values)
+            size = len(values["status"])
+            written += size if begun is not None else 0  # the first chunk's time is that of compiling
+            begun = begun or time.perf_counter()
+            rate = written / max(time.perf_counter() - begun, 1e-9)
+            progress.update(bar, advance=size, rate=f"{rate:.0f}/s" if written else "")
+
+
+def _checked(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
+    from wholearm_jax.batch import check_chunks
+
+    settings = {"tolerance": job.settings["tolerance"], "arrival": job.settings["arrival"]}
+    parts = check_chunks(job.source, job.torque, job.count, chunk=job.chunk, wanted=missing, **settings)
+    for number, part in parts:
+        yield number, part._asdict()
+
+
+def _optimised(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
+    """Optimise every scene of each chunk, one scene a processor."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    import jax
+    import numpy as np
+
+    from wholearm_jax.batch import Checked, from_result
+    from wholearm_jax.optimiser import optimise
+
+    def one(number):
+        found = optimise(job.source.draw(number), knots=job.knots)
+        schedule = np.column_stack([np.asarray(found.torque.times), np.asarray(found.torque.values)])
+        return from_result(found.result), schedule
+
+    with ThreadPoolExecutor(len(jax.local_devices())) as pool:
+        for number in missing:
+            rows = range(number * job.chunk, min(job.count, (number + 1) * job.chunk))
+            results, schedules = zip(*pool.map(one, rows), strict=True)
+            columns = [np.stack([np.asarray(value) for value in column]) for column in zip(*results, strict=True)]
+            yield number, {**Checked(*columns)._asdict(), "torque": np.stack(schedules)}
+
+
+def _report(store, scene, source, out: Path):
+    """What became of all scenes, beside the store: `NAME.json`, and figures."""
+    import json
+
+    import jax
+    import matplotlib.pyplot as plt
+    import numpy as np
+
+    from wholearm_jax.drawing import draw_survey
+    from wholearm_jax.survey import influences, most_influential, survey
+    from wholearm_jax.variation import Ensemble
+    from wholearm_jax.writing import write_whole
+
+    told = survey(scene, (store.read(k) for k in range(store.chunks)), store.count)
+    shown, more = (), {}
+    if isinstance(source, Ensemble) and source.parameters:
+        shifts = np.asarray(jax.lax.map(source.shifts, told.numbers, batch_size=1024))
+        influence = influences(told.margins, shifts)
+        shown = tuple((source.parameters[k], shifts[:, k]) for k in most_influential(source.parameters, influence))
+        pairs = zip(source.parameters, influence.tolist(), strict=True)
+        more = {"influence": {name: rank for name, rank in pairs if rank}}
+    try:
+        write_whole(out.with_suffix(".json"), json.dumps(told.as_dict() | more, indent=1) + "\n")
+        figure = draw_survey(told, more.get("influence"), shown)[0].figure
+        for kind in ("png", "svg"):
+            import io
+
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format=kind, dpi=150, bbox_inches="tight")
+            write_whole(out.with_suffix(f".{kind}"), buffer.getvalue())
+        plt.close(figure)
+    except OSError as error:
+        raise BadInput(f"{out}: cannot be written: {error.strerror}") from None
+    return told

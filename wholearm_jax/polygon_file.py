@@ -1,0 +1,66 @@
+"""Polygons to put in a scene, many in one NumPy file.
+
+`vertices` (`n`, `k`, 2) [m], rows beyond a polygon's `count` (`n`) ignored; `count` may be left out where all have `k`
+vertices; `mass` (`n`) [kg] and `friction` (`n` or `n`, 3) may be given, otherwise they are the scene's. Density is
+uniform.
+"""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from wholearm_jax.batch import Given
+from wholearm_jax.scene import Polygon, Scene
+from wholearm_jax.scene_file import SceneError
+
+
+def read_polygons(path: Path, scene: Scene) -> Given:
+    """The scene with each polygon of a file. Raises `SceneError` naming the file, the entry and what is wrong."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            held = {name: np.asarray(file[name]) for name in file.files}
+    except FileNotFoundError:
+        raise SceneError(f"{path}: no such file") from None
+    except (OSError, ValueError, AttributeError) as error:
+        raise SceneError(f"{path}: not a NumPy .npz file: {error}") from None
+    given = held.get("vertices")
+    if given is None or given.ndim != 3 or given.shape[2] != 2 or given.shape[1] < 3 or not len(given):
+        raise SceneError(f"{path}: vertices: needs an array (polygons, vertices, 2) of at least 3 vertices")
+    many, width = given.shape[:2]
+    count = held.get("count", np.full(many, width))
+    if count.shape != (many,) or count.dtype.kind not in "iu" or count.min() < 3 or count.max() > width:
+        raise SceneError(f"{path}: count: needs one whole number of 3 to {width} a polygon")
+    rows = np.minimum(np.arange(width + (-width % 8)), count[:, None] - 1)  # rows that pad repeat the last vertex
+    vertices = np.take_along_axis(np.asarray(given, float), rows[:, :, None], axis=1)
+    turned = np.roll(vertices, -1, axis=1)  # edges of padding have no length
+    area = (vertices[..., 0] * turned[..., 1] - vertices[..., 1] * turned[..., 0]).sum(1)
+    if not np.all(area > 0):
+        raise SceneError(f"{path}: vertices[{int(np.argmin(area > 0))}]: not a polygon with anticlockwise vertices")
+    mass = _positive(path, "mass", held, (many,), np.asarray(scene.object.mass), strictly=True)
+    friction = held.get("friction", np.asarray(scene.object.friction))
+    friction = friction[:, None] if friction.shape == (many,) else friction
+    friction = _positive(path, "friction", held | {"friction": friction}, (many, 3), friction, strictly=False)
+    _named_vertices(path, scene, count)
+    shape = Polygon(vertices=vertices, count=count, mass=mass, friction=friction)  # pyright: ignore
+    alike = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (many, *np.shape(leaf))), scene)
+    return Given(Scene(scene.title, alike.gravity, alike.hand, shape, alike.start, alike.phases))
+
+
+def _positive(path, name: str, held, shape, otherwise, *, strictly: bool):
+    value = np.asarray(held.get(name, otherwise), float)
+    try:
+        value = np.broadcast_to(value, shape)
+    except ValueError:
+        raise SceneError(f"{path}: {name}: needs one number a polygon") from None
+    if not np.all(np.isfinite(value)) or np.any(value < 0) or (strictly and np.any(value == 0)):
+        raise SceneError(f"{path}: {name}: needs positive numbers")
+    return value
+
+
+def _named_vertices(path, scene: Scene, count) -> None:
+    """Every polygon must have the vertices and edges that the formations name."""
+    highest = max(int(np.max(np.asarray(p.formation.feature))) for p in scene.phases)
+    if count.min() <= highest:
+        row = int(np.argmax(count <= highest))
+        raise SceneError(f"{path}: count[{row}]: the scene's contacts name feature {highest}, which it does not have")

@@ -1,0 +1,156 @@
+"""Vary: ensembles of scenes, endless and the same however they are cut: scene number `i` is drawn from its own key.
+
+Every draw is uniform within plus or minus an amount, of the value itself (`friction=20%`) or in its unit
+(`vertices=0.0005`). The key of a quantity in scene `i` is the seed's, folded with the quantity and with `i`; it
+depends neither on the chunk that `i` is computed in nor on what else varies.
+"""
+
+import math
+import zlib
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from wholearm_jax.scene import COORDINATES, LINKS, Scene
+
+FINGERS = ("finger 1", "finger 2")
+
+
+class Quantity(NamedTuple):
+    """Where floats of a scene that may vary are, and what their entries are called."""
+
+    where: Callable
+    entries: tuple[str, ...] | None = None
+
+
+QUANTITIES = {
+    "vertices": Quantity(lambda s: s.object.vertices),
+    "mass": Quantity(lambda s: s.object.mass),
+    "friction": Quantity(lambda s: s.object.friction, LINKS),
+    "inertia": Quantity(lambda s: s.object.inertia),
+    "center_of_mass": Quantity(lambda s: s.object.center_of_mass, ("x", "y")),
+    "joint": Quantity(lambda s: s.hand.joint, tuple(f"{f} {c}" for f in FINGERS for c in "xy")),
+    "length": Quantity(lambda s: s.hand.length, FINGERS),
+    "offset": Quantity(lambda s: s.hand.offset, FINGERS),
+    "finger_inertia": Quantity(lambda s: s.hand.inertia, FINGERS),
+    "viscous": Quantity(lambda s: s.hand.viscous, FINGERS),
+    "dry": Quantity(lambda s: s.hand.dry, FINGERS),
+    "gravity": Quantity(lambda s: s.gravity, ("x", "y")),
+    "start": Quantity(lambda s: s.start, COORDINATES),
+}
+
+
+class Amount(NamedTuple):
+    """Half the width of a uniform draw: a share of the value where `relative`, otherwise in the value's unit."""
+
+    size: float
+    relative: bool
+
+
+class Ensemble(eqx.Module):
+    """Scenes like `scene` in which the quantities named in `amounts` vary; `seed` chooses which."""
+
+    scene: Scene
+    amounts: tuple[tuple[str, Amount], ...] = eqx.field(static=True)
+    seed: int = eqx.field(static=True, default=0)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """The names of the numbers that vary, in the order of `shifts`; rows of vertices that pad are among them."""
+        return tuple(name for quantity, _ in self.amounts for name in _names(self.scene, quantity))
+
+    def draw(self, number: Int[Array, ""]) -> Scene:
+        """Scene number `number`."""
+        return self.shifted(self.shifts(number))
+
+    def shifts(self, number: Int[Array, ""]) -> Float[Array, "parameters"]:
+        """What is drawn for scene number `number`: one number in [-1, 1] a parameter, to be scaled by its amount."""
+        drawn = [jnp.zeros(0)]
+        for quantity, _ in self.amounts:
+            key = jax.random.fold_in(jax.random.key(self.seed), zlib.crc32(quantity.encode()))
+            size = QUANTITIES[quantity].where(self.scene).size
+            part = jax.random.uniform(jax.random.fold_in(key, number), (size,), float, -1.0, 1.0)
+            if quantity == "vertices":
+                part = jnp.where(jnp.arange(size) // 2 < self.scene.object.count, part, 0.0)
+            drawn.append(part)
+        return jnp.concatenate(drawn)
+
+    def shifted(self, shifts: Float[Array, "parameters"]) -> Scene:
+        """The scene that a draw stands for."""
+        scene, at = self.scene, 0
+        for quantity, amount in self.amounts:
+            where = QUANTITIES[quantity].where
+            value = where(self.scene)
+            part, at = amount.size * shifts[at : at + value.size].reshape(value.shape), at + value.size
+            changed = value * (1 + part) if amount.relative else value + part
+            if quantity == "vertices":  # rows that pad repeat the last vertex
+                count = self.scene.object.count
+                changed = changed[jnp.minimum(jnp.arange(value.shape[0]), count - 1)]
+            scene = eqx.tree_at(where, scene, changed)
+            if quantity == "mass" and scene.object.inertia is not None:
+                ratio = scene.object.mass / self.scene.object.mass
+                scene = eqx.tree_at(lambda s: s.object.inertia, scene, scene.object.inertia * ratio)
+        return scene
+
+
+def vary(scene: Scene, amounts: dict[str, float | str], *, seed: int = 0) -> Ensemble:
+    """Build an ensemble from amounts such as `{"vertices": 0.0005, "friction": "20%"}`.
+
+    Raises ValueError for a quantity that the scene does not have or an amount that is not one.
+    """
+    return Ensemble(scene, tuple((name, _amount(scene, name, given)) for name, given in amounts.items()), seed)
+
+
+def stack(scenes: Sequence[Scene]) -> Scene:
+    """Scenes along a leading axis of every array; polygons are padded to the largest.
+
+    Names and titles are the first scene's. Raises ValueError for scenes that differ in their number of phases, in how
+    a phase arrives, or in whether inertia and centre of mass are given.
+    """
+    capacity = max(s.object.vertices.shape[0] for s in scenes)
+    alike = [_renamed(_padded(s, capacity), scenes[0]) for s in scenes]
+    if len({jax.tree.structure(s) for s in alike}) > 1:
+        raise ValueError("stacked scenes need the same phases (number, arrival) and the same optional entries")
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike)
+
+
+def _padded(scene: Scene, capacity: int) -> Scene:
+    """A scene whose polygon has room for `capacity` vertices."""
+    held = scene.object.vertices
+    more = jnp.broadcast_to(held[-1], (capacity - held.shape[0], 2))
+    return eqx.tree_at(lambda s: s.object.vertices, scene, jnp.concatenate([held, more]))
+
+
+def _renamed(scene: Scene, like: Scene) -> Scene:
+    """A scene with the title and the phases' names of another, which make no difference to what is computed."""
+    if len(scene.phases) != len(like.phases):
+        return scene
+    pairs = zip(scene.phases, like.phases, strict=True)
+    phases = tuple(type(p)(q.name, p.formation, p.heading, p.duration, p.arrive) for p, q in pairs)
+    return Scene(like.title, scene.gravity, scene.hand, scene.object, scene.start, phases)
+
+
+def _names(scene: Scene, quantity: str) -> tuple[str, ...]:
+    entries = QUANTITIES[quantity].entries
+    if quantity == "vertices":
+        entries = tuple(f"{k} {c}" for k in range(scene.object.vertices.shape[0]) for c in "xy")
+    return (quantity,) if entries is None else tuple(f"{quantity} {entry}" for entry in entries)
+
+
+def _amount(scene: Scene, name: str, given: float | str) -> Amount:
+    if name not in QUANTITIES:
+        raise ValueError(f"{name}: not a quantity that varies; these do: {', '.join(QUANTITIES)}")
+    if QUANTITIES[name].where(scene) is None:
+        raise ValueError(f"{name}: the scene does not give it")
+    text = str(given)
+    try:
+        size = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError:
+        size = math.nan
+    if not 0 <= size < math.inf:
+        raise ValueError(f"{name}={text}: write an amount such as 0.0005, in SI units, or 20%")
+    return Amount(size, text.endswith("%"))
