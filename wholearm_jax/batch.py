@@ -27,6 +27,7 @@ from wholearm_jax.plan import (
     joined,
     prepare,
     require_covered,
+    require_motion,
     require_x64,
     run,
     simulate,
@@ -164,8 +165,7 @@ def check_chunks(
     """`check` one chunk after the other: numbers of chunks (those `wanted`, by default all) with their results."""
     require_x64()
     nominal = source.scene if isinstance(source, Ensemble) else source.scenes
-    if any(phase.arrive == "hold" for phase in nominal.phases):
-        raise ValueError("phases that hold the object need linear programmes, which checks of many scenes leave out")
+    require_motion(nominal)  # holds need linear programmes, which compiled checks leave out
     require_covered(nominal, torque)
     mesh = Mesh(np.asarray(devices or jax.local_devices()), ("scenes",))
     levels = (QUICK, FULL) if tolerance >= EXACT else (FULL,)

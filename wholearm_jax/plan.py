@@ -303,6 +303,13 @@ def margin(
     return jnp.stack([jnp.where(jnp.isfinite(m), m, -jnp.inf) for m in moving]).min()
 
 
+def require_motion(scene: Scene) -> None:
+    """Raise ValueError for a plan with a phase that holds the object, where only phases that move it make sense."""
+    for phase in scene.phases:
+        if phase.arrive == "hold":
+            raise ValueError(f"phase '{phase.name}' holds the object; this is for phases that move it")
+
+
 def require_covered(scenes: Scene, torque: Torque) -> None:
     """Raise ValueError for a schedule that is shorter than the plan, or than the longest plan of stacked scenes."""
     total = float(np.max(sum(np.asarray(p.duration) for p in scenes.phases)))
