@@ -35,10 +35,10 @@ from measure import RESULTS, save
 from random_plans import plans as stopping_plans
 
 import wholearm_jax as wa
-from wholearm_jax.drawing import COLOURS
 from wholearm_jax.execution import Ending, Tolerance, execute
-from wholearm_jax.perturbation import wilson
+from wholearm_jax.palette import LINK_COLOURS as COLOURS
 from wholearm_jax.plan import Result, end_configuration, sample
+from wholearm_jax.proportion import wilson
 from wholearm_jax.schedule import padded
 from wholearm_jax.squeeze import coefficients
 from wholearm_jax.status import Status
@@ -48,7 +48,7 @@ jax.config.update("jax_enable_x64", True)
 KNOTS, TIMESTEP = 51, 2e-4  # [s]
 TOLERANCE = Tolerance()
 FREE = 5e-3  # [s] without force from which a contact counts as lost; shorter is chatter of the contact's softness
-MARGIN_OF_TIME = 0.005  # [s] at either end of a phase, while formations change, in which forces are not judged
+MARGIN_OF_TIME = 0.02  # [s] at either end of a phase, while formations change, in which forces are not judged
 HURRY, EARLY = 0.1, 0.05  # speed over the mean speed, and share of the phase left, with which a wire's end is too early
 EACH, DRAWS = 2, 12  # variants of each kind, and draws, a plan
 PUSHES = 0.25  # share of the draws that push
@@ -64,9 +64,12 @@ UNDECIDED = {Status.AMBIGUOUS, Status.SINGULAR, Status.NO_CONVERGENCE, Status.MA
 
 
 class Predicted(NamedTuple):
-    """What the model says: `holds` (None: left out), and whether it holds if forces tensile for less than `FREE` do not
-    count (`lasting`); its least force [N] and the mean force [N]; the longest time `dip` [s] for which a force is
-    tensile, where it is least (share of its phase), and how far from the planned end, over the tolerance, it comes."""
+    """What the model says.
+
+    `holds` (None: left out), and the same if forces count only where they are tensile for `FREE` or longer while
+    formations do not change (`lasting`); the least force and the mean force [N]; the longest such time `dip` [s], where
+    the least force is (share of its phase), and how far from the planned end, over the tolerance, the object comes.
+    """
 
     result: Result
     courses: list
@@ -112,9 +115,11 @@ def predict(scene: wa.Scene, torque: wa.Torque, traced) -> Predicted:
 
 
 def _dip(course) -> float:
-    """The longest time [s] for which one of a phase's forces is tensile."""
+    """The longest time [s] for which one of a phase's forces is tensile where executed ones are judged as well."""
+    begin, end = course.time[0] + MARGIN_OF_TIME, course.time[-1] - MARGIN_OF_TIME
+    cn = course.cn[(course.time >= begin) & (course.time <= end)]
     step = float(course.time[1] - course.time[0])
-    return max(_longest(course.cn[:, k] < 0) for k in range(course.cn.shape[1])) * step
+    return max(_longest(cn[:, k] < 0) for k in range(cn.shape[1])) * step
 
 
 def _bears(phase) -> bool:
@@ -123,7 +128,7 @@ def _bears(phase) -> bool:
 
 
 def _lasts(phase, course) -> bool:
-    """Whether no contact of a phase would have to pull for `FREE` or longer."""
+    """Whether no contact of a phase would have to pull for `FREE` or longer, while formations do not change."""
     pulls = bool(phase.impulses) and min(phase.impulses) < 0
     refused = pulls or any(held.lost is not None for held in phase.holds)
     return _bears(phase) or (phase.status is Status.CONTACT_LOST and not refused and _dip(course) < FREE)
@@ -317,7 +322,7 @@ def explain(predicted: Predicted, found: dict, finer: dict) -> str:
     if finer["holds"] == predicted.holds:
         return "softness: agrees with steps of a quarter"
     if lost and predicted.dip < FREE:
-        return f"tensile for less than {1e3 * FREE:g} ms"
+        return f"tensile for less than {1e3 * FREE:g} ms, or only while formations change"
     if lost and predicted.dip < DIP:
         return f"tensile for {1e3 * FREE:g} to {1e3 * DIP:g} ms"
     if abs(predicted.margin) < CLEAR * predicted.mean:

@@ -162,6 +162,15 @@ def spread(data):
     data["hand"]["finger1"]["joint"], data["hand"]["finger2"]["joint"] = [1.0, 0.0], [-1.0, 0.0]
 
 
+def pause(data):
+    data["phase"][1] = {"name": "pause", "contacts": data["phase"][0]["contacts"], "hold": True, "duration": 0.5}
+
+
+def test_the_search_refuses_a_phase_that_holds(wholearm, scene_file):
+    path = scene_file(pause)
+    assert_bad_input(wholearm("search", path), f"{path}: phase 'pause' holds the object")
+
+
 def shorten(data):
     data["hand"]["finger1"]["length"] = 0.02
 

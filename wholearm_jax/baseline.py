@@ -19,7 +19,7 @@ import numpy as np
 
 from wholearm_jax.motion import Integration
 from wholearm_jax.optimiser import replace_duration
-from wholearm_jax.plan import Result, Traced, require_x64, run, simulate, trace
+from wholearm_jax.plan import Result, Traced, require_motion, require_x64, run, simulate, trace
 from wholearm_jax.scene import Phase, Scene
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.squeeze import coefficients, hold
@@ -54,9 +54,7 @@ def search(scene: Scene, *, longest: float = 10.0) -> Searched:
     ('ok', (4, 2))
     """
     require_x64()
-    for phase in scene.phases:
-        if phase.arrive == "hold":
-            raise ValueError(f"phase '{phase.name}' holds the object: steps of 10 % look for torques that move it")
+    require_motion(scene)
     begun = time.perf_counter()
     traced = trace(scene)
     phases, times, rows, start, count = [], [], [], 0.0, 0

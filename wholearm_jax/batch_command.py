@@ -48,17 +48,21 @@ def check(
         import zarr  # noqa: F401
     except ModuleNotFoundError:
         raise BadInput("checking many scenes needs Zarr: pip install 'wholearm_jax[batch]'") from None
-    from wholearm_jax.batch import require_checkable
+    from wholearm_jax.plan import require_covered, require_motion
     from wholearm_jax.polygon_file import read_polygons
     from wholearm_jax.result_file import read_torque
     from wholearm_jax.scene_file import load
     from wholearm_jax.store import StoreError, fingerprint, identity
 
     loaded, schedule = load(scene), read_torque(torque)
+    try:
+        require_motion(loaded)
+    except ValueError as error:
+        raise BadInput(f"{scene}: {error}") from None
     source = read_polygons(polygons, loaded) if polygons else ensemble(loaded, vary, seed)
     total = count if count is not None else int(source.scenes.object.mass.shape[0])  # pyright: ignore
     try:
-        require_checkable(loaded, schedule)
+        require_covered(loaded, schedule)
     except ValueError as error:
         raise BadInput(f"{torque}: {error}") from None
     settings = {"arrival": arrival, "tolerance": tolerance, "optimise": knots if optimise else None, "seed": seed}

@@ -237,7 +237,10 @@ def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
     from wholearm_jax.baseline import search as look
 
     _traced(scene, loaded)
-    found = look(loaded)
+    try:
+        found = look(loaded)
+    except ValueError as error:
+        raise BadInput(f"{scene}: {error}") from None
     for phase in found.result.phases:
         print(phase.message)
     print(f"{found.simulations} simulations in {found.seconds:.2f} s")

@@ -173,11 +173,11 @@ def draw_forces(result: Result, ax: Axes | None = None, *, legend: bool = True) 
                 slack = grip * course.cn[:, k] - np.abs(course.ct[:, k])
                 label = label and r"its $\mu c_n - |c_t|$"
                 ax.plot(course.time, slack, color=colour, ls=":", label=label)
-    _draw_holds(result, ax)
     ax.set_ylabel("contact force $c_n$ [N]")
     ax.autoscale(axis="y")  # with what other axes hold that share this one
     low, high = ax.get_ylim()
     ax.set_ylim(min(low, 0.0) - 0.14 * (high - min(low, 0.0)), high)
+    _draw_holds(result, ax)
     _mark_margin(result, ax)
     _finish(ax, result)
     return _legend(ax, 3) if legend else ax
@@ -185,12 +185,12 @@ def draw_forces(result: Result, ax: Axes | None = None, *, legend: bool = True) 
 
 def _draw_holds(result: Result, ax: Axes) -> None:
     """Times at which friction holds the object at rest, shaded, with what the contacts can bear there."""
-    label = "held: the best least force"
+    label: str = "held: the best least force"
     for held in (held for phase in result.phases for held in phase.holds):
         ax.axvspan(held.start, held.end, color=_PALE, alpha=0.35, lw=0, zorder=0)
         if np.isfinite(held.margin):
             ax.hlines(held.margin, held.start, held.end, color=_INK, lw=1.0, ls="--", label=label)
-            label = "_"  # named once
+            label = "_nolegend_"
 
 
 def _mark_margin(result: Result, ax: Axes) -> None:

@@ -92,14 +92,14 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
         if phase.arrive == "hold":
             return _steady(scene, phase, at, knots)
         start = _starts([at], [float(phase.duration)], knots, 1.0)[0]
-        return _evenly(phase.duration, at.table.torque_limit * start.torque[0])
+        return _evenly(float(phase.duration), at.table.torque_limit * start.torque[0])
 
     return _in_turn([torques(*pair) for pair in zip(traced, scene.phases, strict=True)])
 
 
 def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...]:
-    """For each phase the certificate that no torque within limits holds it with a larger margin: `squeeze.bound`, and
-    the best of its statics for one that holds the object.
+    """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.bound`), or
+    that of the statics for a phase that holds the object.
 
     Derivation, section 8: a tuple of `Bound`, one a phase, with `value` [N], and `s` and `share` of the wire where
     it is tight.
@@ -231,15 +231,15 @@ def _steady(scene: Scene, phase: Phase, at: Traced, knots: int, rate_limit=None,
     The margin is concave in the torque, so that it is nowhere on that way less than at both its ends.
     """
     if int(at.table.status) != Status.OK:
-        return _evenly(phase.duration, np.zeros((knots, 2)))
+        return _evenly(float(phase.duration), np.zeros((knots, 2)))
     balance, departure = balance_at_start(scene, phase, at)
     best = balance.steadiest(departure).torque
     if before is None or rate_limit is None:
-        return _evenly(phase.duration, np.tile(best, (knots, 1)))
+        return _evenly(float(phase.duration), np.tile(best, (knots, 1)))
     way = best - np.asarray(before)
     reach = rate_limit * np.linspace(0.0, float(phase.duration), knots)
     share = np.minimum(reach / max(np.abs(way).max(), 1e-300), 1.0)
-    return _evenly(phase.duration, np.asarray(before) + share[:, None] * way)
+    return _evenly(float(phase.duration), np.asarray(before) + share[:, None] * way)
 
 
 def _optimise_group(

@@ -23,7 +23,7 @@ from wholearm_jax.scene import Phase, Scene, body, contact_name
 from wholearm_jax.schedule import Torque, has_steps, padded, window
 from wholearm_jax.status import Status
 from wholearm_jax.system import system
-from wholearm_jax.verdict import ARRIVAL, ENDINGS, Verdict, judge
+from wholearm_jax.verdict import ARRIVAL, GOALS, Verdict, judge
 from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
 
 SLIPPING = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
@@ -137,10 +137,10 @@ def prepare(scene_body, hand, gravity, formation, rough, heading, resolution: Re
 
 
 def run(
-    table: Table, schedule: Torque, start, duration, how: Integration, ending, arriving=None, arrival=ARRIVAL
+    table: Table, schedule: Torque, start, duration, how: Integration, goal, arriving=None, arrival=ARRIVAL
 ) -> Outcome:
-    """Simulate one phase from its wire's start, score it and judge how it ends (`ending`: `Phase.arrive`, or its number
-    among `verdict.ENDINGS`).
+    """Simulate one phase from its wire's start, score it and judge whether it ends as `goal` says: a word as in
+    `Phase.arrive`, or a number of `GOALS`.
 
     `arriving` is `z_dot` (SI) at the end of the phase before, for a change of formation while moving (None: at rest);
     `arrival` how near the wire's end the phase must come (`verdict`).
@@ -148,17 +148,17 @@ def run(
     dtype = table.breaks.dtype
     arriving = jnp.asarray(np.zeros(5), dtype) if arriving is None else arriving
     start, duration, arrival = (jnp.asarray(a, dtype) for a in (start, duration, arrival))
-    ending = jnp.asarray(ENDINGS[ending] if isinstance(ending, str) else ending)
-    return _run(table, schedule, start, duration, arriving, how, ending, arrival)
+    goal = jnp.asarray(GOALS[goal] if isinstance(goal, str) else goal)
+    return _run(table, schedule, start, duration, arriving, how, goal, arrival)
 
 
 @eqx.filter_jit
-def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, ending, arrival) -> Outcome:
+def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, goal, arrival) -> Outcome:
     seen = window(schedule, start, duration)
     entered = change(table, arriving)
     motion = move(table, seen, duration, how=how, speed=jnp.maximum(entered.speed, 0.0))
     scored = score(table, seen, duration, motion, how)
-    verdict = judge(table, motion, scored, ending, entered, arrival)
+    verdict = judge(table, motion, scored, goal, entered, arrival)
     last = jnp.maximum(motion.count - 1, 0)
     panel, xi = powers(table, motion.piece[last], motion.s[motion.count])
     leaving = horner(table.velocity[panel], xi) * motion.w[motion.count] / duration
@@ -301,6 +301,13 @@ def margin(
     found = outcomes(scene, torque, trace(scene, resolution=resolution), how)
     moving = [o.score.margin for o, p in zip(found, scene.phases, strict=True) if p.arrive != "hold"]
     return jnp.stack([jnp.where(jnp.isfinite(m), m, -jnp.inf) for m in moving]).min()
+
+
+def require_motion(scene: Scene) -> None:
+    """Raise ValueError for a plan with a phase that holds the object, where only phases that move it make sense."""
+    for phase in scene.phases:
+        if phase.arrive == "hold":
+            raise ValueError(f"phase '{phase.name}' holds the object; this is for phases that move it")
 
 
 def require_covered(scenes: Scene, torque: Torque) -> None:

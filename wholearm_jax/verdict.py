@@ -15,7 +15,7 @@ BRAKING = 12.0
 braking at 6 lengths a duration squared (the even rest-to-rest motion) ends within `a` of a length. Nearer to the end
 time and position do not fix the speed better than this square root."""
 
-ENDINGS = {"moving": 0, "caught": 0, "rest": 1, "hold": 2}
+GOALS = {"moving": 0, "caught": 0, "rest": 1, "hold": 2}
 """How a phase must end, as a number that compiled programs take: at any speed, at rest, where it began."""
 
 PULL = 1e-9  # share of `Change.size` by which an impulse may be negative for rounding
@@ -33,18 +33,18 @@ def judge(
     table: Table,
     motion: Motion,
     score: Score,
-    ending: Int[Array, ""],
+    goal: Int[Array, ""],
     entered: Change,
     arrival: float | Float[Array, ""] = ARRIVAL,
 ) -> Verdict:
-    """Decide the status of a phase that must end as `ending` says (one of `ENDINGS`), within a share `arrival` of its
+    """Decide the status of a phase that must end as `goal` says (one of `GOALS`), within a share `arrival` of its
     wire's length.
 
     The earliest trouble counts: a wire that cannot be traced, an impulse that would pull (or throw the object back)
     where the phase is entered with speed, a tensile force, then how the motion ended. A phase that holds the object
     fails when it departs: `reversed` backward, `not_reached` forward along the way that its wire was traced.
     """
-    at_rest, holds = ending == ENDINGS["rest"], ending == ENDINGS["hold"]
+    at_rest, holds = goal == GOALS["rest"], goal == GOALS["hold"]
     share, s, w = (values[motion.count] for values in (motion.share, motion.s, motion.w))
     speed = jnp.sqrt(BRAKING * jnp.asarray(arrival, s.dtype))
     near = jnp.abs(table.breaks[-1] - s) <= arrival * table.length
