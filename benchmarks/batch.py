@@ -1,15 +1,25 @@
-r"""Many scenes: how many a second one schedule is checked against, over their number; compile time and memory.
+r"""Many scenes: how many a second one schedule is checked against, and what limits it.
 
     python benchmarks/batch.py [--quick]
 
-The heptagon's whole plan, traced anew for every scene (vertices within 0.2 mm, friction within 10 %), in one process on
-one processor. The largest difference of a margin from the full resolution is measured on the smallest batch. The first
-call compiles and is kept apart.
+The heptagon's whole plan (two phases, 2 s), every wire traced anew, vertices within 0.2 mm and friction within 10 %, in
+one process: checks over the size of the batch, checks with the gradient of the margin with respect to all torques,
+optimisations, one process against two, the largest difference of a margin from the full resolution, compile times (the
+first call's, nothing kept) and peak memory. Beside them MuJoCo's rollouts of the same plan with the same scenes on all
+threads, at the longest of some time steps whose object ends within 1 % of its way from the prediction (`pose`), and at
+the longest whose least force is within 1 % of the predicted one, or else the shortest (`margin`; phases are of equal
+length, and twentieths of a phase at its ends are left out, where soft contacts take over).
 """
 
 import argparse
+import json
+import os
 import resource
+import subprocess
+import sys
+import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -18,12 +28,18 @@ import measure
 import numpy as np
 
 import wholearm_jax as wa
-from wholearm_jax.batch import BLOCK
+from wholearm_jax.batch import BLOCK, QUICK, check_scene
+from wholearm_jax.schedule import Torque, padded
 
 jax.config.update("jax_enable_x64", True)
 
 HERE = Path(__file__).parent
-COUNTS = (128, 1024, 10_240, 102_400)
+COUNTS = (128, 1024, 8192)
+OPTIMISED = 3
+VARIED = {"vertices": 0.0002, "friction": "10%"}
+STEPS = (1.6e-3, 8e-4, 4e-4, 2e-4, 1e-4, 5e-5)
+ROLLOUTS = 16
+ARRIVAL = 0.02
 
 
 def memory() -> float:
@@ -31,31 +47,173 @@ def memory() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
+def checks(ensemble, torque, counts) -> dict:
+    """Rates and memory over the size of the batch; the first call's time; the error of the margins."""
+    begun = time.perf_counter()
+    quick = wa.check(ensemble, torque, count=BLOCK, arrival=ARRIVAL)
+    first = time.perf_counter() - begun
+    rows = []
+    for count in counts:
+        begun, busy = time.perf_counter(), time.process_time()
+        wa.check(ensemble, torque, count=count, arrival=ARRIVAL)
+        rate, processor = count / (time.perf_counter() - begun), count / (time.process_time() - busy)
+        rows.append({"count": count, "rate": rate, "rate_processor": processor, "memory": memory()})
+        print(f"check {count}: {rate:.0f} a second, {processor:.0f} a processor-second, {memory():.0f} MiB", flush=True)
+    full = wa.check(ensemble, torque, count=BLOCK, arrival=ARRIVAL, tolerance=1e-10)
+    error = float(np.abs(quick.margin - full.margin).max())
+    print(f"first call {first:.1f} s, error of a margin {error:.1e} N", flush=True)
+    return {"first": first, "error": error, "rows": rows}
+
+
+def gradients(ensemble, torque) -> dict:
+    """Checks with the gradient with respect to all torques, a block at a time."""
+    schedule, how = padded(torque), QUICK.how
+    level = QUICK._replace(how=replace(how, adjoint="both", steps=bool(np.any(np.diff(torque.times) == 0))))
+
+    def one(number):
+        def margin(values):
+            answer, _ = check_scene(ensemble.draw(number), Torque(schedule.times, values), ARRIVAL, level)
+            return answer.margin
+
+        return jax.value_and_grad(margin)(schedule.values)
+
+    block = jax.jit(jax.vmap(one))
+    begun = time.perf_counter()
+    jax.block_until_ready(block(np.arange(BLOCK)))
+    first, begun = time.perf_counter() - begun, time.perf_counter()
+    for k in range(2):
+        jax.block_until_ready(block(np.arange(BLOCK) + k * BLOCK))
+    rate = 2 * BLOCK / (time.perf_counter() - begun)
+    print(f"check and gradient: {rate:.0f} a second, first call {first:.1f} s", flush=True)
+    return {"first": first, "rate": rate}
+
+
+def optimisations(ensemble) -> dict:
+    """Each scene its own schedule, one after the other."""
+    wa.optimise(ensemble.draw(np.asarray(0)))
+    begun = time.perf_counter()
+    for number in range(1, 1 + OPTIMISED):
+        wa.optimise(ensemble.draw(np.asarray(number)))
+    rate = OPTIMISED / (time.perf_counter() - begun)
+    print(f"optimise: {rate:.2f} a second", flush=True)
+    return {"rate": rate}
+
+
+def margin_error(done) -> float:
+    """How far the least force of an execution is from the predicted one, relative, changes of formation left out."""
+    count = len(done.prediction.phases)
+    time, least = done.expected.time, {}
+    share = time / time[-1] * count % 1.0
+    for which in ("expected", "executed"):
+        forces = []
+        for number, phase in enumerate(done.prediction.phases):
+            inside = (time / time[-1] * count // 1 == number) & (share > 0.05) & (share < 0.95)
+            for name in phase.contacts:
+                column = done.expected.cn[:, done.names.index(name)] if which == "expected" else done.force(name)
+                forces.append(np.nanmin(column[inside]))
+        least[which] = min(forces)
+    return float(abs(least["executed"] / least["expected"] - 1))
+
+
+def rollouts(ensemble, torque) -> dict:
+    """MuJoCo on all threads: rates at the longest time step that still ends near the prediction."""
+    from wholearm_jax.execution import clock, execute, motor_torques, start_of
+    from wholearm_jax.free_bodies import Softness, free_bodies
+    from wholearm_jax.perturbation import roll_out, start_near
+
+    prediction = wa.simulate(ensemble.scene, torque)
+    course = np.concatenate([np.asarray(t.z) for t in wa.trajectory(prediction)])
+    moved = np.abs(np.diff(course, axis=0))
+    way, turn = np.hypot(moved[:, 0], moved[:, 1]).sum(), moved[:, 2].sum()
+    scenes = [ensemble.draw(np.asarray(number)) for number in range(ROLLOUTS)]
+    starts = np.stack([start_near(s, start_of(prediction), np.zeros(3)) for s in scenes])
+    rows = []
+    for wanted in STEPS:
+        done = execute(prediction, timestep=wanted)
+        begins, step = clock(ensemble.scene, wanted)
+        models = [free_bodies(s, step, Softness()).model for s in scenes]
+        begun = time.perf_counter()
+        roll_out(models, starts, motor_torques(torque, begins), None)
+        rate = ROLLOUTS / (time.perf_counter() - begun)
+        pose = max(done.position_error / way, abs(done.angle_error) / turn)
+        rows.append({"timestep": step, "rate": rate, "pose_error": float(pose), "margin_error": margin_error(done)})
+        errors = f"end {100 * pose:.2g} % of the way off, margin {100 * rows[-1]['margin_error']:.3g} % off"
+        print(f"MuJoCo at {step:g} s: {rate:.1f} a second, {errors}", flush=True)
+        if rows[-1]["margin_error"] <= 0.01:
+            break
+    by_pose = next((row for row in rows if row["pose_error"] <= 0.01), rows[-1])
+    return {"threads": os.cpu_count(), "rows": rows, "pose": by_pose, "margin": rows[-1]}
+
+
+def processes(number: int, folder: Path, torque: Path, count: int, chunk: int) -> float:
+    """The rate of a store's growth by `number` processes, after each has written its first chunk."""
+    out = folder / f"{number}.zarr"
+    varied = [f"--vary={name}={amount}" for name, amount in VARIED.items()]
+    line = [sys.executable, "-c", "from wholearm_jax.command import main; main()", "check", "heptagon"]
+    line += ["--torque", str(torque), *varied, "--count", str(count), "--chunk", str(chunk), "--out", str(out)]
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder / "programs"), "MPLBACKEND": "agg"}
+    joined = ["--coordinator", "127.0.0.1:47113", "--processes", str(number), "--process"]
+    lines = [[*line, *joined, str(k)] if number > 1 else line for k in range(number)]
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    running = [subprocess.Popen(one, env=environment, **silent) for one in lines]
+    if any(process.wait() for process in running):
+        raise RuntimeError("a check failed")
+    # All processes compute from the last of their first chunks on.
+    written = np.array([(out / "margin" / "c" / str(k)).stat().st_mtime for k in range(count // chunk)])
+    since = max(written[k::number][0] for k in range(number))
+    rate = chunk * int((written > since).sum()) / (written.max() - since)
+    print(f"{number} processes: {rate:.0f} a second", flush=True)
+    return float(rate)
+
+
+def by_processes(torque: Path) -> dict:
+    """Rates of one process and of two."""
+    with tempfile.TemporaryDirectory() as folder:
+        return {str(n): processes(n, Path(folder), torque, 4096, 512) for n in (1, 2)}
+
+
+def draw(found: dict, path: Path) -> None:
+    """Rates over the size of the batch, with lines for what has one rate."""
+    figure, ax = plt.subplots(figsize=(4.2, 3.0), layout="constrained")
+    rows = found["check"]["rows"]
+    ax.loglog([r["count"] for r in rows], [r["rate"] for r in rows], "o-", color="#0072B2", label="check")
+    lines = {
+        "check and gradient": found["gradient"],
+        "MuJoCo, end to 1 %": found["mujoco"]["pose"],
+        "MuJoCo, finest step": found["mujoco"]["margin"],
+        "optimise": found["optimise"],
+    }
+    for (name, part), colour in zip(lines.items(), ("#009E73", "#D55E00", "#E69F00", "#CC79A7"), strict=True):
+        ax.axhline(part["rate"], color=colour, ls="--", lw=1.2, label=name)
+    ax.set(xlabel="scenes", ylabel="plans a second")
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.legend(frameon=False, fontsize=8)
+    figure.savefig(path, bbox_inches="tight")
+
+
 def main() -> None:
     """Measure, save, draw, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="the two smallest batches")
-    counts = COUNTS[:2] if parser.parse_args().quick else COUNTS
+    parser.add_argument("--quick", action="store_true", help="small batches of checks alone; nothing is written")
+    parser.add_argument("--only", help="measure this part anew: check, mujoco, gradient, optimise or processes")
+    given = parser.parse_args()
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are to be fresh
-    ensemble = wa.vary(wa.load("heptagon"), {"vertices": 0.0002, "friction": "10%"}, seed=1)
-    torque = wa.read_torque(HERE / "data" / "heptagon_knots.csv")
-    rows = []
-    begun = time.perf_counter()
-    quick = wa.check(ensemble, torque, count=BLOCK, arrival=0.02)
-    first = time.perf_counter() - begun
-    full = wa.check(ensemble, torque, count=BLOCK, arrival=0.02, tolerance=1e-10)
-    error = float(np.abs(quick.margin - full.margin).max())
-    for count in counts:
-        begun = time.perf_counter()
-        wa.check(ensemble, torque, count=count, arrival=0.02)
-        rows.append({"count": count, "rate": count / (time.perf_counter() - begun), "memory": memory()})
-        print(f"{count} scenes: {rows[-1]['rate']:.0f} a second, {rows[-1]['memory']:.0f} MiB", flush=True)
-    print(f"first call, with compiling: {first:.1f} s; largest error of a margin {error:.1e} N")
-    path = measure.save("batch", {"first": first, "error": error, "rows": rows})
-    figure, axes = plt.subplots(figsize=(3.6, 2.8), layout="constrained")
-    axes.loglog([r["count"] for r in rows], [r["rate"] for r in rows], marker="o", color="#0072B2")
-    axes.set(xlabel="scenes", ylabel="scenes a second")
-    figure.savefig(path.with_suffix(".svg"))
+    ensemble, file = wa.vary(wa.load("heptagon"), VARIED, seed=1), HERE / "data" / "heptagon_knots.csv"
+    torque = wa.read_torque(file)
+    if given.quick:
+        checks(ensemble, torque, COUNTS[:2])
+        return
+    parts = {
+        "check": lambda: checks(ensemble, torque, COUNTS),
+        "mujoco": lambda: rollouts(ensemble, torque),
+        "gradient": lambda: gradients(ensemble, torque),
+        "optimise": lambda: optimisations(ensemble),
+        "processes": lambda: by_processes(file),
+    }
+    kept = measure.RESULTS / "batch.json"
+    found = json.loads(kept.read_text()) if given.only else {}
+    found |= {name: part() for name, part in parts.items() if given.only in (None, name)}
+    draw(found, measure.save("batch", found).with_suffix(".svg"))
 
 
 if __name__ == "__main__":

@@ -79,7 +79,7 @@ def solve(way: Direct, piece, s, w, tau, duration):
         return jnp.concatenate([gaps(way.system.contacts, z), (way.chart @ z - height)[None]])
 
     z = newton(equations, way.z[near] + way.x[near] * (s - way.s[near])).z
-    x, bend = along_wire(way.system, z, way.chart)
+    x, bend, _ = along_wire(way.system, z, way.chart)
     matrix, right = balance(way.system, z, x, bend, way.slip_sign[piece], way.joint_sign[piece])
     v = w / duration
     terms = jnp.concatenate([jnp.stack([jnp.ones_like(v), v**2, v]), tau / way.system.torque_unit])

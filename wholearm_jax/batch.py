@@ -70,7 +70,7 @@ class Level(NamedTuple):
     error: float
 
 
-QUICK = Level(Resolution(6, 16, 8), Integration(tolerance=1e-8, max_steps=128, stages=6), 1e-7)
+QUICK = Level(Resolution(4, 10, 8), Integration(tolerance=1e-8, max_steps=96, stages=4), 1e-6)
 FULL = Level(Resolution(), Integration(), 1e-9)
 
 

@@ -104,7 +104,7 @@ def perturb(
         few = scenes[first : first + CHUNK]
         starts = [start_near(s, nominal, shift) for s, shift in zip(few, shifts[first:], strict=False)]
         models = [free_bodies(s, step, softness).model for s in few]
-        ends = _ends(models, np.stack(starts), torques, threads)
+        ends = roll_out(models, np.stack(starts), torques, threads)
         for s, end in zip(few, ends, strict=True):
             ending, _ = judge(s, end, target, tolerance)
             runs.append(_summary(prediction.scene, s, end, target, ending))
@@ -145,7 +145,7 @@ def _touch_down(shape, hand, gravity, formation: Formation, z, shift) -> Float[A
     return jax.lax.fori_loop(0, 20, closer, displaced) * mechanics.configuration_unit
 
 
-def _ends(models, starts, torques, threads: int | None) -> Float[np.ndarray, "runs 5"]:
+def roll_out(models, starts, torques, threads: int | None) -> Float[np.ndarray, "runs 5"]:
     """Where each model ends, driven from rest at its start."""
     state = mujoco.mjtState.mjSTATE_FULLPHYSICS
     places = np.zeros((len(models), mujoco.mj_stateSize(models[0], state)))

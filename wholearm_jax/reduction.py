@@ -85,11 +85,14 @@ def balance(system: System, z, x, bend, slip_sign, joint_sign):
 
 
 def along_wire(system: System, z, u):
-    """`x = dz/ds` and `x' = d2z/ds2` in the chart with direction `u`: `G x = 0`, `u.x = 1`, `G x' = -x^T H x`."""
+    """`x = dz/ds`, `x' = d2z/ds2` and `det [G; u]` in the chart with direction `u`.
+
+    They solve `G x = 0`, `u.x = 1`, `G x' = -x^T H x`.
+    """
     rows = jnp.concatenate([constraint_rows(system.contacts, z), u[None]])
-    inverted, _ = inverse(rows)
+    inverted, determinant = inverse(rows)
     x = inverted[:, 4]
-    return x, -times(inverted[:, :4], constraint_curvature(system.contacts, z, x))
+    return x, -times(inverted[:, :4], constraint_curvature(system.contacts, z, x)), determinant
 
 
 def reduce_wire(system: System, wire: Wire) -> Table:
@@ -100,13 +103,14 @@ def reduce_wire(system: System, wire: Wire) -> Table:
     chart, xi, turn = wire.chart[owner], wire.slip_sign[owner], wire.joint_sign[owner]
 
     def node(z, u, slip_sign, joint_sign):
-        x, bend = along_wire(system, z, u)
+        x, bend, chart_determinant = along_wire(system, z, u)
         matrix, right = balance(system, z, x, bend, slip_sign, joint_sign)
-        smooth, _ = balance(system, z, x, bend, 0 * slip_sign, joint_sign)
         back, resting = balance(system, z, x, bend, -slip_sign, -joint_sign)
         # Friction may turn the determinant's sign only by passing through a singular matrix.
-        inverted, determinants = jax.vmap(inverse)(jnp.stack([matrix, back, stop_gradient(smooth)]))
-        with_friction, turned, without = stop_gradient(determinants)
+        inverted, determinants = jax.vmap(inverse)(jnp.stack([matrix, back]))
+        with_friction, turned = stop_gradient(determinants)
+        # Without friction, det [M x, -G^T] = x.M x det [G; u]: of M x only the part along x is not in the span of G^T.
+        without = stop_gradient(system.inertia @ x**2 * chart_determinant)
         upright = with_friction * without
         ahead, behind = inverted[0], inverted[1, 0]
         solution = times(ahead, right)

@@ -11,15 +11,15 @@ speed that fits (`verdict`); the next phase then starts at rest at the end, as i
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from wholearm_jax.batch import check
 from wholearm_jax.forces import smooth_margin
 from wholearm_jax.motion import Integration
 from wholearm_jax.optimiser import optimise
@@ -27,10 +27,13 @@ from wholearm_jax.plan import Traced, outcomes, trace
 from wholearm_jax.schedule import Torque
 from wholearm_jax.status import Status
 from wholearm_jax.variation import Ensemble
+from wholearm_jax.verdict import BRAKING
 from wholearm_jax.wire import Resolution
 
 COARSE = Resolution(6, 24, 8)
 HOW = Integration(tolerance=1e-7, max_steps=128, stages=6, adjoint="both", steps=True)
+WITHIN = 0.5  # share of the tolerance of arrival that the climb leaves as it is
+NONE = -10.0  # margin [N] of a phase without any motion
 TEMPERATURE = 0.02  # of the smooth minimum, as a share of the nominal margin
 
 
@@ -71,32 +74,42 @@ def optimise_robustly(
     """
     scene = ensemble.scene
     start = optimise(scene, knots=knots).torque if nominal is None else nominal
-    traced = _traced(ensemble, jnp.arange(samples))
+    seen, unseen = (_traced(ensemble, jnp.arange(samples) + first) for first in (0, samples))
+    tried = jax.jit(lambda torque, traced: _climb(torque, scene, traced, jnp.asarray(arrival)))
+
+    def held(found) -> Held:
+        return Held(float(found.holds.mean()), float(jnp.quantile(found.margins, quantile, method="lower")))
+
     limit = scene.hand.torque_limit
-    adam = optax.adam(rate)
+    adam = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.05))
     share = start.values / limit
     state = adam.init(share)
-    best, best_key = start, (-np.inf, -np.inf)
-    for _ in range(steps):
+    best, nominally, best_held = start, None, Held(-1.0, -np.inf)
+    for _ in range(steps + 1):
         torque = Torque(start.times, share * limit)
-        (margins, holds), slope = _climb(torque, scene, traced, jnp.asarray(arrival))
-        key = (float(holds.mean()), float(jnp.quantile(margins, quantile, method="lower")))
-        if key > best_key:
-            best, best_key = torque, key
-        slope = jnp.where(jnp.isfinite(slope), slope, 0.0) * limit
+        found = tried(torque, seen)
+        now = held(found)
+        nominally = nominally or now
+        if (now.share, now.margin) > (best_held.share, best_held.margin):
+            best, best_held = torque, now
+        slope = jnp.where(jnp.isfinite(found.slope), found.slope, 0.0) * limit
         moves, state = adam.update(-slope, state)
-        share = jnp.clip(share + moves, -1.0, 1.0)
+        share = jnp.clip(optax.apply_updates(share, moves), -1.0, 1.0)
+    assert nominally is not None
+    return Robust(
+        best,
+        start,
+        seen=(nominally, best_held),
+        unseen=(held(tried(start, unseen)), held(tried(best, unseen))),
+    )
 
-    def held(torque, numbers):
-        scenes = jax.lax.map(ensemble.draw, jnp.asarray(numbers))
-        found = check(scenes, torque, arrival=arrival)
-        lowest = np.quantile(found.margin, quantile, method="lower")
-        return Held(float((found.status == Status.OK).mean()), float(lowest))
 
-    both = (start, best)
-    seen = tuple(held(torque, np.arange(samples)) for torque in both)
-    unseen = tuple(held(torque, np.arange(samples, 2 * samples)) for torque in both)
-    return Robust(best, start, seen, unseen)  # pyright: ignore[reportArgumentType]
+class _Climbed(NamedTuple):
+    """Margins [N] of all samples, whether they hold, and the objective's derivative with respect to the torques."""
+
+    margins: Float[Array, "samples"]
+    holds: Bool[Array, "samples"]
+    slope: Float[Array, "rows 2"]
 
 
 @eqx.filter_jit
@@ -105,17 +118,16 @@ def _traced(ensemble: Ensemble, numbers) -> tuple[Traced, ...]:
     return jax.lax.map(lambda n: trace(ensemble.draw(n), resolution=COARSE), numbers, batch_size=32)
 
 
-@eqx.filter_jit
-def _climb(torque: Torque, scene, traced, arrival):
-    """Margins of all samples and whether they hold; the objective's derivative with respect to the torques."""
+def _climb(torque: Torque, scene, traced, arrival) -> _Climbed:
+    """How a schedule does on all samples, and which way it gets better."""
 
     def objective(values) -> tuple[Float[Array, ""], tuple]:
         def one(at):
             found = outcomes(scene, Torque(torque.times, values), at, HOW, arrival)
-            least = jnp.stack([jnp.where(jnp.isfinite(o.score.margin), o.score.margin, -10.0) for o in found]).min()
-            ends = [_missed(o, t.table, arrival) for o, t in zip(found, at, strict=True)]
+            least = jnp.stack([jnp.where(jnp.isfinite(o.score.margin), o.score.margin, NONE) for o in found]).min()
+            missed = jnp.stack([_missed(o, t.table, arrival) for o, t in zip(found, at, strict=True)]).sum()
             holds = jnp.stack([o.verdict.status == int(Status.OK) for o in found]).all()
-            return least, sum(ends), holds
+            return least, missed, holds
 
         margins, missed, holds = jax.vmap(one)(traced)
         weights = jnp.full(margins.shape, 1.0 / margins.shape[0])
@@ -123,13 +135,13 @@ def _climb(torque: Torque, scene, traced, arrival):
         low, _ = smooth_margin(margins, weights, TEMPERATURE * scale)
         return low - scale * missed.mean(), (margins, holds)
 
-    slope, answer = jax.grad(objective, has_aux=True)(torque.values)
-    return answer, slope
+    slope, (margins, holds) = jax.grad(objective, has_aux=True)(torque.values)
+    return _Climbed(margins, holds, slope)
 
 
 def _missed(outcome, table, arrival):
-    """How far beyond the tolerance a phase ends from where it should, squared."""
+    """How far beyond the tolerance a phase ends from where it should: a logarithm, lest the worst sample rule all."""
     at = outcome.motion.count
     place = jnp.abs(table.breaks[-1] - outcome.motion.s[at]) / table.length / arrival
-    speed = outcome.motion.w[at] / table.length / jnp.sqrt(12 * arrival)
-    return jnp.maximum(place - 0.5, 0.0) ** 2 + jnp.maximum(speed - 0.5, 0.0) ** 2
+    speed = outcome.motion.w[at] / table.length / jnp.sqrt(BRAKING * arrival)
+    return jnp.log1p(jnp.maximum(place - WITHIN, 0.0) ** 2) + jnp.log1p(jnp.maximum(speed - WITHIN, 0.0) ** 2)

@@ -498,16 +498,17 @@ def _cut(system, fixed, march, places, start, resolution):
 
     def node(s, guess, u, anchor, anchor_s):
         height = u @ anchor + s - anchor_s
-        z, moved, inverted = _correct(fixed, u, guess, stop_gradient(height))
+        z, moved, inverted = _correct(fixed, u, guess, stop_gradient(height), steps=2)  # the guess has seven digits
 
         def equations(z, system, height):
             return jnp.concatenate([constraints(system.contacts, z), (u @ z - height)[None]])
 
-        return z - times(stop_gradient(inverted), equations(stop_gradient(z), system, height)), moved
+        found = z - times(stop_gradient(inverted), equations(stop_gradient(z), system, height))
+        return found, moved, _speeds(fixed, stop_gradient(found), inverted[:, 4])  # dz/ds is its last column
 
     per_panel = jax.vmap(node, (0, 0, None, None, None))
-    nodes, moved = jax.vmap(per_panel)(s, guess, chart[owner], anchor[owner], anchor_s[owner])
-    slip_sign, joint_sign, missed = _signs(fixed, stop_gradient(nodes), chart, owner, resolution)
+    nodes, moved, speeds = jax.vmap(per_panel)(s, guess, chart[owner], anchor[owner], anchor_s[owner])
+    slip_sign, joint_sign, missed = _signs(stop_gradient(speeds), owner, resolution)
     pairs = system.candidates.lower.shape[0]
     contact = jnp.where(march.end < pairs, march.end, (march.end - pairs) % 4)
     why = jnp.select([march.end < 0, march.end < pairs, march.end < pairs + 8], [NO_END, MADE, LEFT], UNTIL)
@@ -565,15 +566,10 @@ def _interpolate(march, places, s, u):
     )
 
 
-def _signs(system, nodes, chart, owner, resolution):
+def _signs(values, owner, resolution):
     """Signs of slips and joint speeds of each piece, and whether any node contradicts its piece's sign."""
-
-    def speeds(z, u):
-        return _speeds(system, z, tangent(system, z, u))
-
-    values = jax.vmap(jax.vmap(speeds, (0, None)))(nodes, chart[owner])
     total = jax.ops.segment_sum(values.sum(1), owner, resolution.pieces)
-    tolerance = jnp.finfo(nodes.dtype).eps ** 0.625
+    tolerance = jnp.finfo(values.dtype).eps ** 0.625
     signs = _signs_of(total, tolerance)
     missed = jnp.any(values * signs[owner][:, None] < -tolerance) | ~jnp.all(jnp.isfinite(values))
     return signs[:, :4], signs[:, 4:], missed

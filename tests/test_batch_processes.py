@@ -1,0 +1,112 @@
+"""`wholearm check` as users run it: killed at any moment, by several processes, on a full disk."""
+
+import errno
+import os
+import random
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from wholearm_jax.batch import Checked
+from wholearm_jax.store import TYPES, StoreError, identity, open_store
+
+zarr = pytest.importorskip("zarr")
+COUNT, CHUNK, KILLS = 6, 1, 3
+
+
+@pytest.fixture(scope="module")
+def command():
+    """The command as a list that lacks only where its store goes."""
+    torque = Path(__file__).parent / "data" / "heptagon_torque.csv"
+    varied = ["--vary", "vertices=0.0002", "--vary", "friction=10%", "--count", str(COUNT), "--chunk", str(CHUNK)]
+    settings = ["--seed", "3", "--arrival", "0.02", "--tolerance", "1e-10"]  # one program: the full resolution
+    run = "from wholearm_jax.command import main; main()"
+    return [sys.executable, "-c", run, "check", "heptagon", "--torque", str(torque), *varied, *settings]
+
+
+def start(command, store: Path, *more: str) -> subprocess.Popen:
+    """Begin the command in a process of its own, which shares the tests' compiled programs."""
+    kept = jax.config.values["jax_compilation_cache_dir"]
+    environment = {**os.environ, "MPLBACKEND": "agg", "JAX_COMPILATION_CACHE_DIR": kept}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "env": environment}
+    return subprocess.Popen([*command, "--out", str(store), *more], **pipes)
+
+
+def finish(process: subprocess.Popen) -> str:
+    """Wait for success; what it said."""
+    said, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    return said
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """Every array of a store."""
+    group = zarr.open_group(str(path), mode="r")
+    return {name: np.asarray(group[name][:]).tobytes() for name in [*TYPES, "done"]}
+
+
+@pytest.fixture(scope="module")
+def whole(command, tmp_path_factory):
+    """What an uninterrupted process leaves."""
+    path = tmp_path_factory.mktemp("whole") / "whole.zarr"
+    said = finish(start(command, path))
+    assert f"of {COUNT} hold" in said
+    assert path.with_suffix(".json").exists()
+    return contents(path)
+
+
+def test_killed_at_any_moment_it_goes_on_to_the_same_store(command, whole, tmp_path):
+    path, moments = tmp_path / "killed.zarr", random.Random(1)
+    for _ in range(KILLS):
+        process = start(command, path)
+        until = path / "done" / "zarr.json"
+        while process.poll() is None and not until.exists():
+            time.sleep(0.02)
+        time.sleep(moments.uniform(0.0, 4.0))
+        process.kill()
+        process.communicate()
+        assert np.isin(np.frombuffer(contents(path)["done"], "uint8"), (0, 1)).all()  # it can always be read
+    finish(start(command, path))
+    assert contents(path) == whole
+
+
+def test_two_processes_leave_what_one_does(command, whole, tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    path = tmp_path / "two.zarr"
+    both = [
+        start(command, path, "--coordinator", address, "--processes", "2", "--process", str(number))
+        for number in (0, 1)
+    ]
+    said = [finish(process) for process in both]
+    assert f"of {COUNT} hold" in said[0]
+    assert "hold" not in said[1]
+    assert contents(path) == whole
+
+
+def test_a_full_disk_is_an_error_and_what_is_there_stays(tmp_path, monkeypatch):
+    wanted = identity(4, 2, seed=1)
+    store = open_store(tmp_path / "full.zarr", wanted)
+    ones = Checked(*(np.ones((2, *shape)) for shape in ((), (), (), (), (), (5,))))
+    store.write(0, ones._asdict())
+
+    async def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(zarr.storage.LocalStore, "set", full)
+        with pytest.raises(StoreError, match="No space left on device") as caught:
+            store.write(1, ones._asdict())
+    assert "\n" not in str(caught.value)
+    again = open_store(tmp_path / "full.zarr", wanted)
+    assert again.done().tolist() == [True, False]
+    assert np.array_equal(again.read(0).end, ones.end)
+    again.write(1, ones._asdict())
+    assert again.done().all()
