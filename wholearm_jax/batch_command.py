@@ -236,10 +236,9 @@ def _report(store, scene, source, out: Path):
     import json
 
     import jax
-    import matplotlib.pyplot as plt
     import numpy as np
 
-    from wholearm_jax.drawing import draw_survey
+    from wholearm_jax.drawing import draw_survey, save_figure
     from wholearm_jax.survey import influences, most_influential, survey
     from wholearm_jax.variation import Ensemble
     from wholearm_jax.writing import write_whole
@@ -254,14 +253,7 @@ def _report(store, scene, source, out: Path):
         more = {"influence": {name: rank for name, rank in pairs if rank}}
     try:
         write_whole(out.with_suffix(".json"), json.dumps(told.as_dict() | more, indent=1) + "\n")
-        figure = draw_survey(told, more.get("influence"), shown)[0].figure
-        for kind in ("png", "svg"):
-            import io
-
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format=kind, dpi=150, bbox_inches="tight")
-            write_whole(out.with_suffix(f".{kind}"), buffer.getvalue())
-        plt.close(figure)
+        save_figure(lambda: draw_survey(told, more.get("influence"), shown), out.parent, out.stem)
     except OSError as error:
         raise BadInput(f"{out}: cannot be written: {error.strerror}") from None
     return told

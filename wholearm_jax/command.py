@@ -224,9 +224,9 @@ def formations(
         table.add_row(" ".join(way.contacts), way.toward, way.ends, f"{way.length:.2f}", held, top, way.entering)
     Console().print(table)
     if folder is not None:
-        from wholearm_jax.drawing import draw_ways
+        from wholearm_jax.drawing import draw_ways, save_figure
 
-        _save_figure(lambda: draw_ways(loaded, z, found), folder, "formations")
+        save_figure(lambda: draw_ways(loaded, z, found), folder, "formations")
 
 
 @app.command()
@@ -470,40 +470,22 @@ def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> Non
 def _draw_execution(done, folder: Path, video: bool) -> None:
     import matplotlib.pyplot as plt
 
-    from wholearm_jax.drawing import animate, draw_execution, draw_execution_strip
+    from wholearm_jax.drawing import animate, draw_execution, draw_execution_strip, save_figure
 
-    _save_figure(lambda: draw_execution(done), folder, "execution")
+    save_figure(lambda: draw_execution(done), folder, "execution")
     if video:
-        _save_figure(lambda: draw_execution_strip(done), folder, "frames")
+        save_figure(lambda: draw_execution_strip(done), folder, "frames")
         animate(done).save(folder / "execution.gif", writer="pillow")  # which needs no further program
         plt.close("all")
 
 
 def _draw(result, folder: Path) -> None:
-    from wholearm_jax.drawing import draw_result, draw_strip
+    from wholearm_jax.drawing import draw_result, draw_strip, save_figure
     from wholearm_jax.plan import trajectory
 
     figures = {"plan": draw_strip, "result": draw_result} if trajectory(result) else {}  # no motion, nothing to draw
     for name, draw in figures.items():
-        _save_figure(partial(draw, result), folder, name)
-
-
-def _save_figure(draw, folder: Path, name: str) -> None:
-    """Draw with the settings of a paper; write it to look at, and as vectors for the web and for print."""
-    import io
-
-    import matplotlib.pyplot as plt
-
-    from wholearm_jax.drawing import PAPER
-    from wholearm_jax.writing import write_whole
-
-    with plt.rc_context(PAPER):
-        figure = draw().flat[0].figure
-        for kind, undated in (("png", {}), ("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format=kind, dpi=250, bbox_inches="tight", metadata=undated)
-            write_whole(folder / f"{name}.{kind}", buffer.getvalue())
-    plt.close(figure)
+        save_figure(partial(draw, result), folder, name)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,9 @@ matplotlib alone. Sizes of text and lines come from matplotlib's settings; `PAPE
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import matplotlib.pyplot as plt
@@ -22,6 +24,7 @@ from wholearm_jax.plan import Result, trajectory
 from wholearm_jax.scene import Scene, body, parse_contact
 from wholearm_jax.status import Status
 from wholearm_jax.survey import Survey
+from wholearm_jax.writing import write_whole
 
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
     from wholearm_jax.execution import Execution
@@ -356,6 +359,17 @@ def _touches(execution: Execution, name: str) -> bool:
     return bool(execution.course.touch[:, column].any() or execution.expected.touch[:, column].any())
 
 
+def save_figure(draw: Callable[[], Any], folder: Path, name: str) -> None:
+    """Draw with the settings of a paper; write it to look at, and as vectors for the web and for print."""
+    with plt.rc_context(PAPER):
+        figure = np.ravel(draw())[0].figure
+        for kind, undated in (("png", {}), ("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format=kind, dpi=250, bbox_inches="tight", metadata=undated)
+            write_whole(folder / f"{name}.{kind}", buffer.getvalue())
+        plt.close(figure)
+
+
 def _spans(times, flags):
     """Intervals of time in which a flag holds."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
@@ -414,14 +428,14 @@ def draw_survey(
     them the figure is the histogram alone.
     """
     panels = 1 + bool(influence) + (len(parameters) == 2)
-    if axes is None:
-        axes = plt.subplots(1, panels, figsize=(3.1 * panels, 2.9), layout="constrained", squeeze=False)[1][0]
-    _draw_margins(told, axes[0])
+    size = {"figsize": (3.1 * panels, 2.9), "layout": "constrained", "squeeze": False}
+    chosen = axes if axes is not None else plt.subplots(1, panels, **size)[1][0]
+    _draw_margins(told, chosen[0])
     if influence:
-        _draw_influence(influence, axes[1])
+        _draw_influence(influence, chosen[1])
     if len(parameters) == 2:
-        _draw_map(told, parameters, axes[panels - 1])
-    return axes
+        _draw_map(told, parameters, chosen[panels - 1])
+    return chosen
 
 
 def _draw_margins(told: Survey, ax: Axes) -> None:

@@ -334,7 +334,7 @@ _HOW = Integration()
 LOST = 1e-6  # share of a step at which a descent gives up
 
 
-def _evenly(duration: float, values) -> Torque:
+def _evenly(duration, values) -> Torque:
     return Torque(jnp.asarray(np.linspace(0.0, float(duration), len(values))), jnp.asarray(values))
 
 
