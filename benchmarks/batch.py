@@ -30,6 +30,7 @@ import numpy as np
 import wholearm_jax as wa
 from wholearm_jax.batch import BLOCK, QUICK, check_scene
 from wholearm_jax.schedule import Torque, padded
+from wholearm_jax.variation import vary
 
 jax.config.update("jax_enable_x64", True)
 
@@ -198,7 +199,7 @@ def main() -> None:
     parser.add_argument("--only", help="measure this part anew: check, mujoco, gradient, optimise or processes")
     given = parser.parse_args()
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are to be fresh
-    ensemble, file = wa.vary(wa.load("heptagon"), VARIED, seed=1), HERE / "data" / "heptagon_knots.csv"
+    ensemble, file = vary(wa.load("heptagon"), VARIED, seed=1), HERE / "data" / "heptagon_knots.csv"
     torque = wa.read_torque(file)
     if given.quick:
         checks(ensemble, torque, COUNTS[:2])

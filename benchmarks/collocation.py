@@ -482,7 +482,7 @@ def _collected(table: Table, phase: Phase, solves: list[Solve]) -> Collocated:
     best = max(solves, key=lambda one: one.rank)
     torque = best.course.tau * phase.wire.limit
     schedule = padded(wa.torque(np.linspace(0, phase.duration, phase.knots), torque))
-    outcome = run(table, schedule, jnp.zeros(()), jnp.asarray(phase.duration), Integration(), True)
+    outcome = run(table, schedule, jnp.zeros(()), jnp.asarray(phase.duration), Integration(), "rest")
     last = int(outcome.motion.count)
     return Collocated(
         torque=torque,

@@ -19,7 +19,8 @@ import numpy as np
 from random_plans import FRICTION, MASS, _grasps, _polygon, write
 
 import wholearm_jax as wa
-from wholearm_jax.formations import Way, leaving, start_configuration, ways
+from wholearm_jax.formations import Way, leaving, ways
+from wholearm_jax.plan import start_configuration
 from wholearm_jax.scene import Phase, formation, heading
 from wholearm_jax.scene_file import to_dict
 
@@ -30,10 +31,11 @@ SHORTEST, LEAST_BOUND, SLOWED = 0.2, 0.2, 0.2  # wire [object radii], bound [N],
 
 def flying_plans(count: int, seed: int = 0, *, phases: int = 3, pace: float = 0.4) -> tuple[wa.Scene, ...]:
     """The first `count` plans of `phases` phases, `pace` seconds for each object radius; no two share a polygon."""
-    return tuple(itertools.islice(_plans(np.random.default_rng(seed), phases, pace), count))
+    return tuple(itertools.islice(plans(np.random.default_rng(seed), phases, pace), count))
 
 
-def _plans(rng: np.random.Generator, phases: int, pace: float) -> Iterator[wa.Scene]:
+def plans(rng: np.random.Generator, phases: int, pace: float) -> Iterator[wa.Scene]:
+    """One plan after another, without end."""
     hand = to_dict(wa.load("heptagon"))["hand"]
     for number in itertools.count():
         shape = {

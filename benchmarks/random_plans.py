@@ -38,7 +38,7 @@ PLACES = 6  # places on the palm tried for each edge
 def random_plans(count: int, seed: int = 0, *, phases: int = 2, duration: float = 1.0) -> tuple[wa.Scene, ...]:
     """The first `count` plans of `phases` (1 or 2) phases, each of `duration` [s]; no two share a polygon."""
     rng = np.random.default_rng(seed)
-    return tuple(itertools.islice(_plans(rng, phases, duration), count))
+    return tuple(itertools.islice(plans(rng, phases, duration), count))
 
 
 def write(scenes: tuple[wa.Scene, ...], folder: Path) -> None:
@@ -48,7 +48,8 @@ def write(scenes: tuple[wa.Scene, ...], folder: Path) -> None:
         wa.save(scene, folder / f"plan_{number:02d}.toml")
 
 
-def _plans(rng: np.random.Generator, phases: int, duration: float) -> Iterator[wa.Scene]:
+def plans(rng: np.random.Generator, phases: int, duration: float) -> Iterator[wa.Scene]:
+    """One plan after another, without end."""
     hand = to_dict(wa.load("heptagon"))["hand"]
     for number in itertools.count():
         shape = {

@@ -21,7 +21,7 @@ from wholearm_jax.scene import Formation, Hand, Heading, Polygon, body
 from wholearm_jax.schedule import Torque, torque_in, window
 from wholearm_jax.squeeze import holds
 from wholearm_jax.system import configuration_unit, system
-from wholearm_jax.verdict import judge
+from wholearm_jax.verdict import GOALS, judge
 from wholearm_jax.wire import Resolution, Wire, trace_wire
 
 PLACES = np.concatenate([[0.0], (np.arange(30) + 0.5) / 30 + 0.01 * np.sin(np.arange(30.0)), [1.0]])
@@ -102,7 +102,7 @@ def follow(wire: Wire, table: Table, scene: Scenes, how: Integration) -> Followe
     motion = move(table, seen, scene.duration, how=how)
     found = score(table, seen, scene.duration, motion, how)
     entered = change(table, jnp.zeros_like(scene.rough))
-    verdict, moving = (judge(table, motion, found, at_rest, entered) for at_rest in (True, False))
+    verdict, moving = (judge(table, motion, found, goal, entered) for goal in (GOALS["rest"], GOALS["moving"]))
     end, s, w = (values[motion.count] for values in (motion.share, motion.s, motion.w))
     steps = arcs(table, seen, scene.duration, motion)
     unit = configuration_unit(jnp.sqrt((solid_vertices(scene) ** 2).sum(1).max()))

@@ -106,7 +106,7 @@ def _problem(scene, traced, phase, kind, unreduced, referred) -> Problem:
     given = wa.read_torque(HERE / "data" / f"heptagon_{kind}.csv")
     start, duration = jnp.asarray(float(phase)), jnp.asarray(float(scene.phases[phase].duration))
     schedule = jax.jit(padded)(given)
-    outcome = plan.run(traced[phase].table, schedule, start, duration, Integration(tolerance=1e-13), False)
+    outcome = plan.run(traced[phase].table, schedule, start, duration, Integration(tolerance=1e-13), "moving")
     assert not bool(outcome.motion.held[0]), "the references do not wait"
     end = float(outcome.motion.share[int(outcome.motion.count)])
     stop = min(STOP.get(kind, 1.0), end)
@@ -189,11 +189,11 @@ def package(problem: Problem, solver: str, tolerance: float):
 
     def again():
         traced = plan.prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading)
-        return plan.run(traced.table, *here, how, False)
+        return plan.run(traced.table, *here, how, "moving")
 
     calls = {
         "package": lambda: _move(table, problem.seen, problem.duration, how),
-        "package, run": lambda: plan.run(table, *here, how, False),
+        "package, run": lambda: plan.run(table, *here, how, "moving"),
         "package, trace and run": again,
     }
     return error(problem, *rows), count, calls

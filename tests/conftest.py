@@ -1,13 +1,16 @@
-"""Every test computes in 64 bits, and leaves room for the programs of those that follow."""
+"""Every test computes in 64 bits, compiles as the command line does, and leaves room for those that follow."""
 
 from pathlib import Path
 
 import jax
 import pytest
 
+from wholearm_jax.command import compile_quickly
+
 MAPPED = 30_000  # half of the memory areas that Linux grants a process by default
 
 jax.config.update("jax_enable_x64", True)
+compile_quickly()
 
 
 @pytest.fixture(autouse=True, scope="session")

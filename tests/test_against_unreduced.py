@@ -48,7 +48,7 @@ def compared(name, phase, tolerance, samples):
     scene = SCENES[name]()
     table = wholearm_jax.trace(scene)[phase].table
     torque, start, length = passing(table), jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = plan.run(table, torque, start, length, Integration(tolerance=tolerance), False).motion
+    motion = plan.run(table, torque, start, length, Integration(tolerance=tolerance), "moving").motion
     steps = np.asarray(motion.share)[: int(motion.count) + 1]
     assert int(motion.status) == wholearm_jax.Status.LEFT_FORMATION
     assert 0.5 < steps[-1] < 1.0
@@ -128,7 +128,7 @@ def test_start_after_waiting(name, phase):
     times = np.concatenate([[0.0], delay + np.asarray(later.times)])
     values = np.concatenate([[held.torque], np.asarray(later.values)])
     torque, start, length = wholearm_jax.torque(times, values), jnp.asarray(0.0), jnp.asarray(times[-1])
-    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-12), False).motion
+    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-12), "moving").motion
     assert bool(motion.held[0])
     steps = np.asarray(motion.share)[: int(motion.count) + 1]
     assert np.all(np.diff(steps) >= 0)

@@ -23,7 +23,7 @@ def test_balance(name, phase):
     several = contacts(solid, hand, scene.phases[phase].formation)
     table = wholearm_jax.trace(scene)[phase].table
     torque, start, length = passing(table), jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-13, max_steps=512), False).motion
+    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-13, max_steps=512), "moving").motion
     ends = np.asarray(motion.share)[: int(motion.count) + 1]
     x, weight = np.polynomial.legendre.leggauss(NODES)
     low, high = ends[:-1, None], ends[1:, None]

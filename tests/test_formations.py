@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.formations import leaving, start_configuration, touching, ways
-from wholearm_jax.plan import end_configuration
+from wholearm_jax.formations import leaving, touching, ways
+from wholearm_jax.plan import end_configuration, start_configuration
 
 
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])

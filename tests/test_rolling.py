@@ -112,7 +112,7 @@ def test_against_unreduced(rolling):
     """Motion and all forces of a passage against the independent simulation of five coordinates."""
     data, traced, torque = rolling
     table, start, length = traced.table, jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-13), False).motion
+    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-13), "moving").motion
     assert int(motion.status) == wholearm_jax.Status.LEFT_FORMATION
     end = float(motion.share[motion.count]) * (1 - 1e-12)
     steps = np.asarray(motion.share)[: int(motion.count)]
@@ -150,7 +150,7 @@ def test_energy(rolling):
     data, traced, torque = rolling
     scene, table = wholearm_jax.parse(data), traced.table
     start, length = jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-13, max_steps=512), False).motion
+    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-13, max_steps=512), "moving").motion
     ends = np.asarray(motion.share)[: int(motion.count) + 1]
     x, weight = np.polynomial.legendre.leggauss(8)
     low, high = ends[:-1, None], ends[1:, None]

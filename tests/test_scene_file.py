@@ -252,6 +252,8 @@ NUMBERS = [
     ((*PHASE, "toward", "z-"), "phase[1].toward: 'z-' is not a coordinate and a sign"),
     ((*PHASE, "toward", ""), "phase[1].toward: '' is not a coordinate and a sign"),
     ((*PHASE, "arrive", "flying"), "phase[1].arrive: must be 'rest', 'moving' or 'caught'"),
+    ((*PHASE, "hold", True), "phase[1].toward: a phase with hold = true does not move; leave it out"),
+    ((*PHASE, "hold", 1), "phase[1].hold: must be true or false"),
     ((*PHASE, "name", 3), "phase[1].name: must be text"),
     (("phase", []), "phase: must have at least 1 item"),
     (("object", 3), "object: must be a table"),

@@ -2,7 +2,7 @@
 
 Read the modules in this order: `scene`, `contacts`, `system`, `wire` (trace), `reduction` (reduce), `schedule`,
 `motion` (simulate), `forces` (score), `verdict`, `plan`, `squeeze` (quasi-static torques and the bound), `shooting`,
-`descent` and `optimiser` (optimise), `baseline` (the paper's search).
+`descent` and `optimiser` (optimise), `baseline` (the paper's search), `variation` and `batch` (many scenes at once).
 """
 
 from wholearm_jax.baseline import search
@@ -12,15 +12,13 @@ from wholearm_jax.optimiser import bounds, optimise, quasistatic
 from wholearm_jax.plan import margin, simulate, trace, trajectory
 from wholearm_jax.result_file import read_torque, write_torque
 from wholearm_jax.scene import Scene
-from wholearm_jax.scene_file import SceneError, load, parse, save
+from wholearm_jax.scene_file import load, parse, save
 from wholearm_jax.schedule import Torque, torque
 from wholearm_jax.status import Status
-from wholearm_jax.variation import vary
 
 __all__ = [
     "Integration",
     "Scene",
-    "SceneError",
     "Status",
     "Torque",
     "bounds",
@@ -37,6 +35,5 @@ __all__ = [
     "torque",
     "trace",
     "trajectory",
-    "vary",
     "write_torque",
 ]

@@ -19,7 +19,7 @@ import numpy as np
 
 from wholearm_jax.motion import Integration
 from wholearm_jax.optimiser import replace_duration
-from wholearm_jax.plan import Result, Traced, require_x64, run, simulate, trace
+from wholearm_jax.plan import Result, Traced, require_motion, require_x64, run, simulate, trace
 from wholearm_jax.scene import Phase, Scene
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.squeeze import coefficients, hold
@@ -45,7 +45,7 @@ def search(scene: Scene, *, longest: float = 10.0) -> Searched:
     """Search each phase's torques by steps of 10 %; no phase may take longer than `longest` seconds.
 
     A phase for which no raise works keeps the attempt with the largest margin, and the result's status says what it
-    does.
+    does. Raises ValueError for a plan with a phase that holds the object.
 
     The paper's section 3.1 (derivation, section 10). Raises RuntimeError without float64.
 
@@ -54,6 +54,7 @@ def search(scene: Scene, *, longest: float = 10.0) -> Searched:
     ('ok', (4, 2))
     """
     require_x64()
+    require_motion(scene)
     begun = time.perf_counter()
     traced = trace(scene)
     phases, times, rows, start, count = [], [], [], 0.0, 0
@@ -113,6 +114,6 @@ _hold, _coefficients = eqx.filter_jit(hold), eqx.filter_jit(coefficients)
 def _attempt(table, torque, longest) -> tuple[Status, float, float]:
     """One simulation under constant torques: status, margin and the time at which it ended."""
     schedule = padded(Torque(jnp.asarray([0.0, longest]), jnp.asarray(np.stack([torque, torque]))))
-    outcome = run(table, schedule, jnp.zeros(()), jnp.asarray(longest), Integration(), False)
+    outcome = run(table, schedule, jnp.zeros(()), jnp.asarray(longest), Integration(), "caught")
     end = float(outcome.motion.share[int(outcome.motion.count)]) * longest
     return Status(int(outcome.verdict.status)), float(outcome.score.margin), max(end, 1e-6)

@@ -27,6 +27,7 @@ from wholearm_jax.plan import (
     joined,
     prepare,
     require_covered,
+    require_motion,
     require_x64,
     run,
     simulate,
@@ -36,7 +37,7 @@ from wholearm_jax.scene import Formation, Heading, Scene, body
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.status import Status
 from wholearm_jax.variation import Ensemble, stack
-from wholearm_jax.verdict import ARRIVAL
+from wholearm_jax.verdict import ARRIVAL, GOALS
 from wholearm_jax.wire import Resolution
 
 BLOCK = 128  # scenes that one device takes at once
@@ -106,7 +107,7 @@ class _Phases(NamedTuple):
     formation: Formation
     heading: Heading
     duration: Float[Array, "phases"]
-    at_rest: Bool[Array, "phases"]
+    goal: Int[Array, "phases"]
     moving: Bool[Array, "phases"]
 
 
@@ -164,6 +165,7 @@ def check_chunks(
     """`check` one chunk after the other: numbers of chunks (those `wanted`, by default all) with their results."""
     require_x64()
     nominal = source.scene if isinstance(source, Ensemble) else source.scenes
+    require_motion(nominal)  # holds need linear programmes, which compiled checks leave out
     require_covered(nominal, torque)
     mesh = Mesh(np.asarray(devices or jax.local_devices()), ("scenes",))
     levels = (QUICK, FULL) if tolerance >= EXACT else (FULL,)
@@ -228,7 +230,7 @@ def check_scene(scene: Scene, schedule: Torque, arrival, level: Level) -> tuple[
     """Check one scene (under any transformation), and say whether this level's result is good enough."""
     solid = body(scene.object)
     phases = [
-        _Phases(p.formation, p.heading, p.duration, jnp.asarray(p.arrive == "rest"), jnp.asarray(p.arrive == "moving"))
+        _Phases(p.formation, p.heading, p.duration, jnp.asarray(GOALS[p.arrive]), jnp.asarray(p.arrive == "moving"))
         for p in scene.phases
     ]
     zero = jnp.zeros((), scene.start.dtype)
@@ -239,7 +241,7 @@ def check_scene(scene: Scene, schedule: Torque, arrival, level: Level) -> tuple[
         traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, level.resolution)
         after = joined(traced, rough)
         traced = jax.tree.map(lambda a, b: jnp.where(first, a, b), traced, after)
-        done = run(traced.table, schedule, start, planned - start, level.how, phase.at_rest, arriving, arrival)
+        done = run(traced.table, schedule, start, planned - start, level.how, phase.goal, arriving, arrival)
         stop = _stop(traced, done, phase.formation, level)
         left = start + done.duration * done.motion.share[done.motion.count]
         start = jnp.where(phase.moving, left, planned)

@@ -48,13 +48,17 @@ def check(
         import zarr  # noqa: F401
     except ModuleNotFoundError:
         raise BadInput("checking many scenes needs Zarr: pip install 'wholearm_jax[batch]'") from None
-    from wholearm_jax.plan import require_covered
+    from wholearm_jax.plan import require_covered, require_motion
     from wholearm_jax.polygon_file import read_polygons
     from wholearm_jax.result_file import read_torque
     from wholearm_jax.scene_file import load
     from wholearm_jax.store import StoreError, fingerprint, identity
 
     loaded, schedule = load(scene), read_torque(torque)
+    try:
+        require_motion(loaded)
+    except ValueError as error:
+        raise BadInput(f"{scene}: {error}") from None
     source = read_polygons(polygons, loaded) if polygons else ensemble(loaded, vary, seed)
     total = count if count is not None else int(source.scenes.object.mass.shape[0])  # pyright: ignore
     try:
@@ -232,10 +236,9 @@ def _report(store, scene, source, out: Path):
     import json
 
     import jax
-    import matplotlib.pyplot as plt
     import numpy as np
 
-    from wholearm_jax.drawing import draw_survey
+    from wholearm_jax.drawing import draw_survey, save_figure
     from wholearm_jax.survey import influences, most_influential, survey
     from wholearm_jax.variation import Ensemble
     from wholearm_jax.writing import write_whole
@@ -250,15 +253,7 @@ def _report(store, scene, source, out: Path):
         more = {"influence": {name: rank for name, rank in pairs if rank}}
     try:
         write_whole(out.with_suffix(".json"), json.dumps(told.as_dict() | more, indent=1) + "\n")
-        figure = draw_survey(told, more.get("influence"), shown)[0].get_figure(root=True)
-        assert figure is not None
-        for kind in ("png", "svg"):
-            import io
-
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format=kind, dpi=150, bbox_inches="tight")
-            write_whole(out.with_suffix(f".{kind}"), buffer.getvalue())
-        plt.close(figure)
+        save_figure(lambda: draw_survey(told, more.get("influence"), shown), out.parent, out.stem)
     except OSError as error:
         raise BadInput(f"{out}: cannot be written: {error.strerror}") from None
     return told

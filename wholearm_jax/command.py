@@ -36,7 +36,8 @@ def main() -> None:
     os.environ.setdefault("MPLBACKEND", "agg")
     jax.config.update("jax_enable_x64", True)
     _keep_compiled()
-    _compile_quickly()
+    if sys.argv[1:2] != ["check"]:  # many scenes at once run longer than they compile
+        compile_quickly()
     from wholearm_jax.scene_file import SceneError
 
     try:
@@ -55,7 +56,7 @@ def _keep_compiled() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
-def _compile_quickly() -> None:
+def compile_quickly() -> None:
     """Have XLA emit kernels in its older way: half of the compile time, at a tenth more run time for one scene.
 
     XLA refuses flags that it does not know: this is for the version that was measured.
@@ -110,6 +111,8 @@ def optimise(
     from wholearm_jax.optimiser import optimise as find
 
     begun = time.perf_counter()
+    compile_ahead(loaded, knots=knots)
+    traced = _traced(scene, loaded)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bars = [progress.add_task(p.name, total=steps, state="waiting") for p in loaded.phases]
@@ -119,8 +122,6 @@ def optimise(
             progress.update(bars[step.phase], completed=step.step + 1, state=state)
 
         progress.update(bars[0], state="compiling")
-        compile_ahead(loaded, knots=knots)
-        traced = _traced(scene, loaded)
         found = find(loaded, knots=knots, steps=steps, rate_limit=rate_limit, callback=show, traced=traced)
         for bar, why in zip(bars, found.stopped, strict=True):
             progress.update(bar, completed=steps, state=why)
@@ -157,6 +158,8 @@ def simulate(
     result = _predicted(loaded, schedule, torque, tolerance, traced)
     for phase in result.phases:
         print(phase.message)
+        for held in phase.holds:
+            print(f"    {held.message}")
     if check_gradient:
         _check_gradient(loaded, schedule)
     tops = tuple(float(b.value) for b in bounds(loaded, traced=traced))
@@ -198,8 +201,8 @@ def formations(
     from rich.console import Console
     from rich.table import Table
 
-    from wholearm_jax.formations import leaving, start_configuration, touching, ways
-    from wholearm_jax.plan import end_configuration
+    from wholearm_jax.formations import leaving, touching, ways
+    from wholearm_jax.plan import destination, start_configuration
 
     traced = _traced(scene, loaded)
     if after is None:
@@ -209,7 +212,8 @@ def formations(
         if row is None:
             names = ", ".join(p.name for p in loaded.phases)
             raise BadInput(f"--after {after}: no such phase; phases: {names}")
-        z, z_dot = end_configuration(traced[row]), leaving(traced[row].table)
+        z = destination(loaded.phases[row], traced[row])
+        z_dot = None if loaded.phases[row].arrive == "hold" else leaving(traced[row].table)
     found = ways(loaded, z, z_dot)
     table = Table(title=f"touching: {', '.join(touching(loaded, z))}")
     for column in ("contacts", "toward", "leads to", "length", "static N", "bound N", "enter at speed"):
@@ -220,9 +224,9 @@ def formations(
         table.add_row(" ".join(way.contacts), way.toward, way.ends, f"{way.length:.2f}", held, top, way.entering)
     Console().print(table)
     if folder is not None:
-        from wholearm_jax.drawing import draw_ways
+        from wholearm_jax.drawing import draw_ways, save_figure
 
-        _save_figure(lambda: draw_ways(loaded, z, found), folder, "formations")
+        save_figure(lambda: draw_ways(loaded, z, found), folder, "formations")
 
 
 @app.command()
@@ -233,7 +237,10 @@ def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
     from wholearm_jax.baseline import search as look
 
     _traced(scene, loaded)
-    found = look(loaded)
+    try:
+        found = look(loaded)
+    except ValueError as error:
+        raise BadInput(f"{scene}: {error}") from None
     for phase in found.result.phases:
         print(phase.message)
     print(f"{found.simulations} simulations in {found.seconds:.2f} s")
@@ -345,7 +352,7 @@ def _traced(name: str, scene):
     import numpy as np
 
     from wholearm_jax.contacts import constraints, frames, placed
-    from wholearm_jax.plan import end_configuration, trace
+    from wholearm_jax.plan import destination, trace
     from wholearm_jax.scene import body
     from wholearm_jax.system import system
 
@@ -362,7 +369,7 @@ def _traced(name: str, scene):
     for k, (phase, at) in enumerate(zip(scene.phases, traced, strict=True)):
         if int(at.table.status) == 0:
             continue
-        rough = end_configuration(traced[k - 1]) if k > 0 else scene.start
+        rough = destination(scene.phases[k - 1], traced[k - 1]) if k > 0 else scene.start
         gap, length, unit = apart(phase.formation, at.wire.start, rough)
         where = "with the others, from this start"
         if k > 0 and not np.any(gap > 1e-6):
@@ -463,40 +470,22 @@ def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> Non
 def _draw_execution(done, folder: Path, video: bool) -> None:
     import matplotlib.pyplot as plt
 
-    from wholearm_jax.drawing import animate, draw_execution, draw_execution_strip
+    from wholearm_jax.drawing import animate, draw_execution, draw_execution_strip, save_figure
 
-    _save_figure(lambda: draw_execution(done), folder, "execution")
+    save_figure(lambda: draw_execution(done), folder, "execution")
     if video:
-        _save_figure(lambda: draw_execution_strip(done), folder, "frames")
+        save_figure(lambda: draw_execution_strip(done), folder, "frames")
         animate(done).save(folder / "execution.gif", writer="pillow")  # which needs no further program
         plt.close("all")
 
 
 def _draw(result, folder: Path) -> None:
-    from wholearm_jax.drawing import draw_result, draw_strip
+    from wholearm_jax.drawing import draw_result, draw_strip, save_figure
     from wholearm_jax.plan import trajectory
 
     figures = {"plan": draw_strip, "result": draw_result} if trajectory(result) else {}  # no motion, nothing to draw
     for name, draw in figures.items():
-        _save_figure(partial(draw, result), folder, name)
-
-
-def _save_figure(draw, folder: Path, name: str) -> None:
-    """Draw with the settings of a paper; write it to look at, and as vectors for the web and for print."""
-    import io
-
-    import matplotlib.pyplot as plt
-
-    from wholearm_jax.drawing import PAPER
-    from wholearm_jax.writing import write_whole
-
-    with plt.rc_context(PAPER):
-        figure = draw().flat[0].figure
-        for kind, undated in (("png", {}), ("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format=kind, dpi=250, bbox_inches="tight", metadata=undated)
-            write_whole(folder / f"{name}.{kind}", buffer.getvalue())
-    plt.close(figure)
+        save_figure(partial(draw, result), folder, name)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,9 @@ matplotlib alone. Sizes of text and lines come from matplotlib's settings; `PAPE
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import matplotlib.pyplot as plt
@@ -22,6 +24,7 @@ from wholearm_jax.plan import Result, trajectory
 from wholearm_jax.scene import Scene, body, parse_contact
 from wholearm_jax.status import Status
 from wholearm_jax.survey import Survey
+from wholearm_jax.writing import write_whole
 
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
     from wholearm_jax.execution import Execution
@@ -174,14 +177,25 @@ def draw_forces(result: Result, ax: Axes | None = None, *, legend: bool = True) 
     ax.autoscale(axis="y")  # with what other axes hold that share this one
     low, high = ax.get_ylim()
     ax.set_ylim(min(low, 0.0) - 0.14 * (high - min(low, 0.0)), high)
+    _draw_holds(result, ax)
     _mark_margin(result, ax)
     _finish(ax, result)
     return _legend(ax, 3) if legend else ax
 
 
+def _draw_holds(result: Result, ax: Axes) -> None:
+    """Times at which friction holds the object at rest, shaded, with what the contacts can bear there."""
+    label: str = "held: the best least force"
+    for held in (held for phase in result.phases for held in phase.holds):
+        ax.axvspan(held.start, held.end, color=_PALE, alpha=0.35, lw=0, zorder=0)
+        if np.isfinite(held.margin):
+            ax.hlines(held.margin, held.start, held.end, color=_INK, lw=1.0, ls="--", label=label)
+            label = "_nolegend_"
+
+
 def _mark_margin(result: Result, ax: Axes) -> None:
     """A dot at the margin, and its words below the curves."""
-    worst = min(result.phases, key=lambda p: p.margin)
+    worst = result.hardest
     if not np.isfinite(worst.margin):
         return
     ax.axhline(worst.margin, color=_PALE, lw=0.6, zorder=0)
@@ -345,6 +359,17 @@ def _touches(execution: Execution, name: str) -> bool:
     return bool(execution.course.touch[:, column].any() or execution.expected.touch[:, column].any())
 
 
+def save_figure(draw: Callable[[], Any], folder: Path, name: str) -> None:
+    """Draw with the settings of a paper; write it to look at, and as vectors for the web and for print."""
+    with plt.rc_context(PAPER):
+        figure = np.ravel(draw())[0].figure
+        for kind, undated in (("png", {}), ("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format=kind, dpi=250, bbox_inches="tight", metadata=undated)
+            write_whole(folder / f"{name}.{kind}", buffer.getvalue())
+        plt.close(figure)
+
+
 def _spans(times, flags):
     """Intervals of time in which a flag holds."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
@@ -403,15 +428,14 @@ def draw_survey(
     them the figure is the histogram alone.
     """
     panels = 1 + bool(influence) + (len(parameters) == 2)
-    drawn: Sequence[Axes] = axes or list(
-        plt.subplots(1, panels, figsize=(3.1 * panels, 2.9), layout="constrained", squeeze=False)[1][0]
-    )
-    _draw_margins(told, drawn[0])
+    size = {"figsize": (3.1 * panels, 2.9), "layout": "constrained", "squeeze": False}
+    chosen = axes if axes is not None else plt.subplots(1, panels, **size)[1][0]
+    _draw_margins(told, chosen[0])
     if influence:
-        _draw_influence(influence, drawn[1])
+        _draw_influence(influence, chosen[1])
     if len(parameters) == 2:
-        _draw_map(told, parameters, drawn[panels - 1])
-    return drawn
+        _draw_map(told, parameters, chosen[panels - 1])
+    return chosen
 
 
 def _draw_margins(told: Survey, ax: Axes) -> None:

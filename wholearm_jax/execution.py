@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 
 from wholearm_jax.contacts import contacts, frames
 from wholearm_jax.free_bodies import FreeBodies, Softness, free_bodies
-from wholearm_jax.plan import Result, end_configuration, trajectory
+from wholearm_jax.plan import Result, destination, trajectory
 from wholearm_jax.scene import Body, Formation, Hand, Scene, body, formation
 from wholearm_jax.schedule import Torque
 from wholearm_jax.status import Status
@@ -177,10 +177,10 @@ def start_of(prediction: Result) -> Float[np.ndarray, "5"]:
 
 
 def target_of(prediction: Result) -> Float[np.ndarray, "5"]:
-    """Where the plan ends: its last wire's end, or the predicted end where it need not stand still there."""
+    """Where the plan ends: its last phase's destination, or the predicted end where it need not stand still there."""
     last = prediction.phases[-1]
-    moving = prediction.scene.phases[-1].arrive != "rest" and prediction.status is Status.OK
-    end = trajectory(prediction, 2)[-1].z[-1] if moving else end_configuration(last.traced)
+    moving = last.arrive in ("moving", "caught") and prediction.status is Status.OK
+    end = trajectory(prediction, 2)[-1].z[-1] if moving else destination(prediction.scene.phases[-1], last.traced)
     return np.asarray(end)
 
 

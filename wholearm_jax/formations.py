@@ -59,13 +59,6 @@ class Way:
 
 
 @jax.jit
-def start_configuration(table: Table) -> Float[Array, "5"]:
-    """`z` (SI) where a wire starts."""
-    panel, xi = powers(table, jnp.asarray(0), table.breaks[0])
-    return horner(table.configuration[panel], xi)
-
-
-@jax.jit
 def leaving(table: Table) -> Float[Array, "5"]:
     """`z_dot` (SI) at a wire's end for `ds/dt = 1`."""
     panel, xi = powers(table, table.count - 1, table.breaks[-1])

@@ -96,7 +96,7 @@ class _FirstStep(dfx.AbstractAdaptiveStepSizeController):
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         speed = stop_gradient(y0[1])
         half = jnp.where(speed > 0, self.way / jnp.where(speed > 0, 2 * speed, 1.0), 1.0)
-        first = jnp.clip(half, jnp.finfo(t0.dtype).eps, 1 / 32).astype(t0.dtype)
+        first = jnp.clip(half, jnp.finfo(half.dtype).eps, 1 / 32)
         return self.controller.init(terms, t0, t1, y0, first, args, func, error_order)
 
     def adapt_step_size(self, *at):
@@ -414,17 +414,19 @@ def _land(table, seen, duration, how, piece, node, end, goal, floor, wanted):
     _, _, length = jax.lax.fori_loop(0, LANDINGS, narrow, (0 * fixed[3], fixed[3], fixed[3] / 2))
     y = step(share, length, jnp.stack([s, w]), args)
     rate = stop_gradient(field(share + length, y, args))
-    passed = wanted & beyond(stop_gradient(y))[0]
-    target = jnp.where(passed, jnp.where(jnp.isfinite(goal), goal, 0.0), 0.0)
-    which = jnp.where(passed, 0, 1)
-    pace = jnp.where(wanted & (rate[which] != 0), rate[which], 1.0)
-    late = jnp.where(wanted, (target - y[which]) / pace, 0.0)
+    # An object that comes to rest just at the goal does both: it lands on the one that is nearer in time.
+    targets = jnp.stack([jnp.where(jnp.isfinite(goal), goal, 0.0), jnp.zeros_like(goal)])
+    lates = (targets - y) / jnp.where(wanted & (rate != 0), rate, 1.0)
+    possible = jnp.stack([jnp.isfinite(goal) & (rate[0] > 0), jnp.isfinite(floor) & (rate[1] < 0)])
+    which = jnp.argmin(jnp.where(possible, jnp.abs(stop_gradient(lates)), jnp.inf))
+    passed = wanted & (which == 0)
+    late = jnp.where(wanted, lates[which], 0.0)
     astray = wanted & ~(jnp.abs(late) <= longest)
     late = jnp.where(astray, 0.0, late)
     y = y + rate * late
     return (
         share + length + late,
-        jnp.where(passed, target, y[0]),
+        jnp.where(passed, targets[0], y[0]),
         jnp.where(passed, y[1], 0.0),
         passed,
         astray,

@@ -1,6 +1,7 @@
 """Optimise: the torque schedule of a plan with the largest compressive margin.
 
-Phases that begin and end at rest have each their own problem; those that follow one another at speed have one together.
+Phases that begin and end at rest have each their own problem; those that follow one another at speed have one together;
+those that hold the object have the best torque of its statics (`holding`).
 It starts from the quasi-static torques of a smooth motion, descends (`descent`) while the temperature of the smooth
 margin falls, and keeps the best schedule whose honest simulation succeeds.
 """
@@ -20,7 +21,7 @@ import optax
 
 from wholearm_jax.descent import COLDEST, JOINED, Limits, advance, begin, interior_point, passed_on, projected
 from wholearm_jax.motion import Integration
-from wholearm_jax.plan import Result, Traced, describe, outcomes, require_x64, run, trace
+from wholearm_jax.plan import Result, Traced, balance_at_start, describe, outcomes, require_x64, run, stays, trace
 from wholearm_jax.reduction import blank
 from wholearm_jax.scene import Phase, Scene
 from wholearm_jax.schedule import Torque, padded, rounded
@@ -78,7 +79,7 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
 
     The motion's speed is `v ~ u^p (1 - u)^q` in `u = t / duration`: the even `p = q = 1` unless another of `PROFILES`
     allows a larger margin. As the inverse dynamics at the knots only, the schedule carries the object near the wire's
-    end, not exactly to it.
+    end, not exactly to it. A phase that holds the object gets its best torque.
 
     Derivation, section 8. Returns `knots` rows a phase.
 
@@ -86,13 +87,19 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
     (22, 2)
     """
     traced = traced or trace(scene)
-    pairs = zip(traced, scene.phases, strict=True)
-    starts = [(p, at.table.torque_limit, _starts([at], [float(p.duration)], knots, 1.0)[0]) for at, p in pairs]
-    return _in_turn([_evenly(float(p.duration), limit * start.torque[0]) for p, limit, start in starts])
+
+    def torques(at, phase):
+        if phase.arrive == "hold":
+            return _steady(scene, phase, at, knots)
+        start = _starts([at], [float(phase.duration)], knots, 1.0)[0]
+        return _evenly(float(phase.duration), at.table.torque_limit * start.torque[0])
+
+    return _in_turn([torques(*pair) for pair in zip(traced, scene.phases, strict=True)])
 
 
 def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...]:
-    """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.bound`).
+    """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.bound`), or
+    that of the statics for a phase that holds the object.
 
     Derivation, section 8: a tuple of `Bound`, one a phase, with `value` [N], and `s` and `share` of the wire where
     it is tight.
@@ -103,7 +110,17 @@ def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...
     traced = traced or trace(scene)
     begins = [True, *(p.arrive != "moving" for p in scene.phases[:-1])]
     rows = zip(traced, scene.phases, begins, strict=True)
-    return tuple(_bound(at.table, p.duration, jnp.asarray(b), jnp.asarray(p.arrive == "rest")) for at, p, b in rows)
+
+    def top(at, phase, begin):
+        if phase.arrive != "hold":
+            return _bound(at.table, phase.duration, jnp.asarray(begin), jnp.asarray(phase.arrive == "rest"))
+        known = int(at.table.status) == Status.OK
+        if not known:
+            return Bound(jnp.asarray(-np.inf), at.table.breaks[0], jnp.zeros(()))
+        balance, departure = balance_at_start(scene, phase, at)
+        return Bound(jnp.asarray(balance.best(departure).margin), at.table.breaks[0], jnp.zeros(()))
+
+    return tuple(top(*row) for row in rows)
 
 
 def optimise(
@@ -125,8 +142,9 @@ def optimise(
     torque limits hold, and `rate_limit` [N m/s] if given. `durations = (shortest, longest)` lets each phase choose its
     own. `optimiser` replaces the interior point by any optax optimiser (`descent.projected`). A phase stops when its
     margin comes within `tolerance` of the bound or no longer improves by that share, or after `steps`. `callback` sees
-    every step; `traced` reuses the result of `trace`. Where no torque can hold a formation, nothing is searched and the
-    status says so.
+    every step; `traced` reuses the result of `trace`. A phase that holds the object keeps its duration and gets the
+    best torque of its statics, approached as fast as `rate_limit` allows. Where no torque can hold a formation,
+    nothing is searched and the status says so.
 
     Derivation, section 9. Raises RuntimeError without float64.
 
@@ -145,10 +163,15 @@ def optimise(
     for group in joint:
         parts = tuple(scene.phases[k] for k in group)
         before = found[-1].values[-1] if rate_limit is not None and found else None
+        if parts[0].arrive == "hold":
+            found.append(_steady(scene, parts[0], traced[group[0]], knots, rate_limit, before))
+            stopped.append("the best torque of a linear programme")
+            continue
         own = [traced[k] for k in group], [tops[k] for k in group]
         task = _Task(group[0], parts, *own, knots, rows, steps, tolerance)
         limits = _limits(task, rate_limit, durations, before)
-        schedules, why, taken = _optimise_group(task, limits, before, _method(optimiser, len(group)), callback)
+        method = _method(optimiser, len(group))
+        schedules, why, taken = _optimise_group(scene, task, limits, before, method, callback)
         found += schedules
         stopped += [why] * len(group)
         history += taken
@@ -165,7 +188,8 @@ def compile_ahead(
 ) -> list[Future[None]]:
     """Begin to compile the programs of `optimise` in threads of their own, as can be done while wires are traced."""
     rows = rounded(knots * len(scene.phases))
-    return [_ahead(n, knots, rows, _method(optimiser, n)) for n in sorted({len(group) for group in _groups(scene)})]
+    sizes = {len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"}
+    return [_ahead(n, knots, rows, _method(optimiser, n)) for n in sorted(sizes)]
 
 
 def _groups(scene: Scene) -> list[list[int]]:
@@ -201,7 +225,26 @@ class _Task:
         return _stacked([at.table for at in self.traced])
 
 
-def _optimise_group(task: _Task, limits: Limits, before, method, callback) -> tuple[list[Torque], str, list[Step]]:
+def _steady(scene: Scene, phase: Phase, at: Traced, knots: int, rate_limit=None, before=None) -> Torque:
+    """The best torque to hold an object, from time 0; from the torque `before` straight there at a limited rate.
+
+    The margin is concave in the torque, so that it is nowhere on that way less than at both its ends.
+    """
+    if int(at.table.status) != Status.OK:
+        return _evenly(float(phase.duration), np.zeros((knots, 2)))
+    balance, departure = balance_at_start(scene, phase, at)
+    best = balance.steadiest(departure).torque
+    if before is None or rate_limit is None:
+        return _evenly(float(phase.duration), np.tile(best, (knots, 1)))
+    way = best - np.asarray(before)
+    reach = rate_limit * np.linspace(0.0, float(phase.duration), knots)
+    share = np.minimum(reach / max(np.abs(way).max(), 1e-300), 1.0)
+    return _evenly(float(phase.duration), np.asarray(before) + share[:, None] * way)
+
+
+def _optimise_group(
+    scene, task: _Task, limits: Limits, before, method, callback
+) -> tuple[list[Torque], str, list[Step]]:
     """Descend from one start after the other, until one comes near the bound or two agree.
 
     Returns the best schedules (each from time 0), why their descent stopped, and the steps taken.
@@ -225,7 +268,7 @@ def _optimise_group(task: _Task, limits: Limits, before, method, callback) -> tu
             start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[0, 0].set(before / limit))
         p, why, taken = _descend(task, start, number, limits, method, callback)
         history += taken
-        key = _honest(task, p)
+        key = _honest(scene, task, p)
         agree = key[0] and best_key[0] and abs(key[1] - best_key[1]) <= task.tolerance
         if key > best_key:
             best, best_key, reason = p, key, why
@@ -277,7 +320,7 @@ def _compile(phases: int, knots: int, rows: int, method) -> None:
     p = Variables(*(jnp.asarray(a) for a in empty))
     advance(begin(p, method), tables, limits, _HOW, method)
     zero, one = jnp.asarray(np.zeros(())), jnp.asarray(_ONE)
-    run(table, _padded(_evenly(1.0, empty[0][0]), rows), zero, one, Integration(), True)
+    run(table, _padded(_evenly(1.0, empty[0][0]), rows), zero, one, Integration(), "rest")
 
 
 @functools.cache
@@ -291,7 +334,7 @@ _HOW = Integration()
 LOST = 1e-6  # share of a step at which a descent gives up
 
 
-def _evenly(duration: float, values) -> Torque:
+def _evenly(duration, values) -> Torque:
     return Torque(jnp.asarray(np.linspace(0.0, float(duration), len(values))), jnp.asarray(values))
 
 
@@ -310,16 +353,18 @@ def _schedules(task: _Task, p: Variables) -> list[Torque]:
     return [_evenly(length, rows) for length, rows in zip(lengths, values, strict=True)]
 
 
-def _honest(task: _Task, p: Variables) -> tuple[bool, float]:
-    """Whether a simulation of the schedules says `ok`, and the least margin over its bound."""
+def _honest(scene: Scene, task: _Task, p: Variables) -> tuple[bool, float]:
+    """Whether a simulation of the schedules says `ok`, holds included, and the least margin over its bound."""
     start, shares, fine, arriving = 0.0, [], [], None
-    schedule = _padded(_in_turn(_schedules(task, p)), task.rows)
+    torque = _in_turn(_schedules(task, p))
+    schedule = _padded(torque, task.rows)
     ends = np.cumsum(np.exp(np.asarray(p.log_duration)))
     for phase, at, end, top in zip(task.phases, task.traced, ends, task.bounds, strict=True):
-        one = run(at.table, schedule, start, end - start, Integration(), phase.arrive == "rest", arriving)
+        one = run(at.table, schedule, start, end - start, Integration(), phase.arrive, arriving)
         start += float(one.duration) * float(np.asarray(one.motion.share)[int(one.motion.count)])
         arriving = one.leaving if phase.arrive == "moving" else None
-        fine.append(int(one.verdict.status) == Status.OK)
+        held = stays(scene, torque, phase, at, one)
+        fine.append(int(one.verdict.status) == Status.OK and all(h.lost is None for h in held))
         shares.append(float(one.score.margin) / top)
     least = min(shares)
     return all(fine), least if np.isfinite(least) else -np.inf

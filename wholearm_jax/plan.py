@@ -3,10 +3,10 @@
 Each phase starts where the wire of the phase before it ended: at rest, or, where that phase arrives `moving`, with the
 speed that the impact leaves (`reduction.change`), at the moment when the formation changes. It has time until its
 planned end. Two compiled programs serve every phase of every scene: `prepare` (trace and reduce) and `run` (simulate,
-score, judge).
+score, judge). Where friction holds the object at rest, `holding` says whether the contacts can, and with which margin.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,13 +16,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wholearm_jax.forces import Score, arcs, force, on_arc, score
+from wholearm_jax.holding import Departure, Held, Statics, statics, watch
 from wholearm_jax.motion import Integration, Motion, move
 from wholearm_jax.reduction import Change, Table, change, horner, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, body, contact_name
 from wholearm_jax.schedule import Torque, has_steps, padded, window
 from wholearm_jax.status import Status
 from wholearm_jax.system import system
-from wholearm_jax.verdict import ARRIVAL, Verdict, judge
+from wholearm_jax.verdict import ARRIVAL, GOALS, Verdict, judge
 from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
 
 SLIPPING = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
@@ -57,6 +58,8 @@ class PhaseResult:
     `time` is when the phase ended or failed. A phase that is entered while moving begins at `start` with `impulses`
     [N s], one a contact.
     `slips` says that the contact lost is one that should roll, and that it leaves its friction cone.
+    `margin` is the least force while the object moves; while friction holds it at rest forces are not determined, and
+    `holds` says what the contacts can do. A phase that only holds has the margin of its hold.
     """
 
     name: str
@@ -73,6 +76,7 @@ class PhaseResult:
     margin_s: float
     margin_contact: str
     impulses: tuple[float, ...]
+    holds: tuple[Held, ...]
     traced: Traced
     outcome: Outcome
 
@@ -88,7 +92,11 @@ class PhaseResult:
 
 @dataclass(frozen=True)
 class Result:
-    """A simulated plan. `margin` [N] is the least over its phases; `status` that of the first phase that is not ok."""
+    """A simulated plan. `status` is that of the first phase that is not ok.
+
+    `margin` [N] is the least over its phases, those that only hold left out unless there are no others; `hold_margin`
+    is the least of its holds, None without any.
+    """
 
     scene: Scene
     torque: Torque
@@ -99,8 +107,18 @@ class Result:
         return next((p.status for p in self.phases if p.status is not Status.OK), Status.OK)
 
     @property
+    def hardest(self) -> PhaseResult:
+        """The phase whose margin is the plan's."""
+        moving = [p for p in self.phases if p.arrive != "hold"]
+        return min(moving or self.phases, key=lambda p: p.margin)
+
+    @property
     def margin(self) -> float:
-        return min(p.margin for p in self.phases)
+        return self.hardest.margin
+
+    @property
+    def hold_margin(self) -> float | None:
+        return min((held.margin for p in self.phases for held in p.holds), default=None)
 
     @property
     def message(self) -> str:
@@ -119,9 +137,10 @@ def prepare(scene_body, hand, gravity, formation, rough, heading, resolution: Re
 
 
 def run(
-    table: Table, schedule: Torque, start, duration, how: Integration, at_rest, arriving=None, arrival=ARRIVAL
+    table: Table, schedule: Torque, start, duration, how: Integration, goal, arriving=None, arrival=ARRIVAL
 ) -> Outcome:
-    """Simulate one phase from its wire's start, score it and judge it: it must end at rest if `at_rest`.
+    """Simulate one phase from its wire's start, score it and judge whether it ends as `goal` says: a word as in
+    `Phase.arrive`, or a number of `GOALS`.
 
     `arriving` is `z_dot` (SI) at the end of the phase before, for a change of formation while moving (None: at rest);
     `arrival` how near the wire's end the phase must come (`verdict`).
@@ -129,16 +148,17 @@ def run(
     dtype = table.breaks.dtype
     arriving = jnp.asarray(np.zeros(5), dtype) if arriving is None else arriving
     start, duration, arrival = (jnp.asarray(a, dtype) for a in (start, duration, arrival))
-    return _run(table, schedule, start, duration, arriving, how, jnp.asarray(at_rest), arrival)
+    goal = jnp.asarray(GOALS[goal] if isinstance(goal, str) else goal)
+    return _run(table, schedule, start, duration, arriving, how, goal, arrival)
 
 
 @eqx.filter_jit
-def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, at_rest, arrival) -> Outcome:
+def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, goal, arrival) -> Outcome:
     seen = window(schedule, start, duration)
     entered = change(table, arriving)
     motion = move(table, seen, duration, how=how, speed=jnp.maximum(entered.speed, 0.0))
     scored = score(table, seen, duration, motion, how)
-    verdict = judge(table, motion, scored, at_rest, entered, arrival)
+    verdict = judge(table, motion, scored, goal, entered, arrival)
     last = jnp.maximum(motion.count - 1, 0)
     panel, xi = powers(table, motion.piece[last], motion.s[motion.count])
     leaving = horner(table.velocity[panel], xi) * motion.w[motion.count] / duration
@@ -154,6 +174,27 @@ def end_configuration(traced: Traced) -> Float[Array, "5"]:
     table = traced.table
     panel, xi = powers(table, table.count - 1, table.breaks[-1])
     return horner(table.configuration[panel], xi)
+
+
+@jax.jit
+def start_configuration(table: Table) -> Float[Array, "5"]:
+    """`z` (SI) where a wire starts."""
+    panel, xi = powers(table, jnp.asarray(0), table.breaks[0])
+    return horner(table.configuration[panel], xi)
+
+
+def destination(phase: Phase, traced: Traced) -> Float[Array, "5"]:
+    """`z` (SI) where a phase should end: at its wire's end, or where it began if it holds the object."""
+    return start_configuration(traced.table) if phase.arrive == "hold" else end_configuration(traced)
+
+
+def balance_at_start(scene: Scene, phase: Phase, traced: Traced) -> tuple[Statics, Departure]:
+    """The statics where a phase begins, and the accelerations with which the object would leave."""
+    table = traced.table
+    panel, xi = powers(table, jnp.asarray(0), table.breaks[0])
+    ahead, behind = jax.device_get((horner(table.acceleration[panel], xi), horner(table.backward[panel], xi)))
+    balance = statics(scene, phase.formation, start_configuration(table))
+    return balance, Departure(ahead[[0, 3, 4]], behind)
 
 
 def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: float = 1e-9) -> tuple[Traced, ...]:
@@ -174,8 +215,11 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     solid, rough, found = body(scene.object), scene.start, []
     for phase in scene.phases:
         traced = _refined(solid, scene, phase, rough, resolution, tolerance)
+        if phase.arrive == "hold" and _concrete(traced.table.status) and int(traced.table.status) != Status.OK:
+            other = eqx.tree_at(lambda p: p.heading.sign, phase, -phase.heading.sign)
+            traced = _refined(solid, scene, other, rough, resolution, tolerance)
         found.append(joined(traced, rough) if found else traced)
-        rough = end_configuration(traced)
+        rough = destination(phase, traced)
     return tuple(found)
 
 
@@ -225,7 +269,7 @@ def outcomes(
     arriving = still
     for phase, at in zip(scene.phases, traced, strict=True):
         planned = planned + phase.duration
-        one = run(at.table, schedule, start, planned - start, how, phase.arrive == "rest", arriving, arrival)
+        one = run(at.table, schedule, start, planned - start, how, phase.arrive, arriving, arrival)
         found.append(one)
         flying = phase.arrive == "moving"
         start = start + one.duration * one.motion.share[one.motion.count] if flying else planned
@@ -245,7 +289,7 @@ def margin(
 
     Differentiable, in forward and reverse mode, with respect to the torques and every float of the scene; negative
     where a contact would pull; `-inf` where a phase has no motion to score. Whether the plan succeeds is for
-    `simulate` to say.
+    `simulate` to say. Phases that hold the object do not count.
 
     The forces are those of the paper's section 2.2, its `c_n > 0` (derivation, sections 4 and 7). Needs float64:
     without, wires cannot be traced and the margin is `-inf`.
@@ -255,7 +299,15 @@ def margin(
     0.70 N
     """
     found = outcomes(scene, torque, trace(scene, resolution=resolution), how)
-    return jnp.stack([jnp.where(jnp.isfinite(o.score.margin), o.score.margin, -jnp.inf) for o in found]).min()
+    moving = [o.score.margin for o, p in zip(found, scene.phases, strict=True) if p.arrive != "hold"]
+    return jnp.stack([jnp.where(jnp.isfinite(m), m, -jnp.inf) for m in moving]).min()
+
+
+def require_motion(scene: Scene) -> None:
+    """Raise ValueError for a plan with a phase that holds the object, where only phases that move it make sense."""
+    for phase in scene.phases:
+        if phase.arrive == "hold":
+            raise ValueError(f"phase '{phase.name}' holds the object; this is for phases that move it")
 
 
 def require_covered(scenes: Scene, torque: Torque) -> None:
@@ -311,27 +363,59 @@ def describe(scene: Scene, torque: Torque, traced, found) -> Result:
         verdict, scored = outcome.verdict, outcome.score
         slot, of_slot = int(verdict.contact), phase.formation.contact_of_slot
         known = bool(np.isfinite(scored.margin)) and int(at.table.status) == Status.OK
-        rows.append(
-            PhaseResult(
-                name=phase.name,
-                arrive=phase.arrive,
-                contacts=names,
-                status=Status(int(verdict.status)),
-                time=start + length * float(verdict.share),
-                contact=names[of_slot[slot]] if slot >= 0 else None,
-                slips=slot >= 0 and bool(phase.formation.tangential[slot]),
-                start=start,
-                duration=length,
-                margin=float(scored.margin) if known else float("-inf"),
-                margin_time=start + length * float(scored.share),
-                margin_s=float(scored.s),
-                margin_contact=names[of_slot[int(scored.contact)]],
-                impulses=tuple(float(outcome.entered.impulse[k]) for k in phase.formation.normal_slots),
-                traced=at,
-                outcome=outcome,
-            )
+        one = PhaseResult(
+            name=phase.name,
+            arrive=phase.arrive,
+            contacts=names,
+            status=Status(int(verdict.status)),
+            time=start + length * float(verdict.share),
+            contact=names[of_slot[slot]] if slot >= 0 else None,
+            slips=slot >= 0 and bool(phase.formation.tangential[slot]),
+            start=start,
+            duration=length,
+            margin=float(scored.margin) if known else float("-inf"),
+            margin_time=start + length * float(scored.share),
+            margin_s=float(scored.s),
+            margin_contact=names[of_slot[int(scored.contact)]],
+            impulses=tuple(float(outcome.entered.impulse[k]) for k in phase.formation.normal_slots),
+            holds=stays(scene, torque, phase, at, outcome),
+            traced=at,
+            outcome=outcome,
         )
+        rows.append(_with_holds(one))
     return Result(scene, torque, tuple(rows))
+
+
+def stays(scene: Scene, torque: Torque, phase: Phase, traced: Traced, outcome: Outcome) -> tuple[Held, ...]:
+    """Every time that friction holds the object at rest in a phase: waiting to start, or stopped on the way."""
+    motion = jax.device_get(outcome.motion)
+    if int(traced.table.status) != Status.OK:
+        return ()
+    start, duration = float(outcome.start), float(outcome.duration)
+    found = []
+    for k in np.flatnonzero(motion.held[: int(motion.count)]):
+        z = _configuration(traced.table, motion.piece[k], motion.s[k])
+        begin, end = (start + duration * float(share) for share in motion.share[k : k + 2])
+        found.append(watch(statics(scene, phase.formation, z), torque, begin, end))
+    return tuple(found)
+
+
+@jax.jit
+def _configuration(table: Table, piece, s):
+    panel, xi = powers(table, piece, s)
+    return horner(table.configuration[panel], xi)
+
+
+def _with_holds(phase: PhaseResult) -> PhaseResult:
+    """A phase is lost where the contacts cannot hold the object; one that only holds has its hold's margin."""
+    if phase.arrive == "hold" and phase.holds:
+        least = min(phase.holds, key=lambda held: held.margin)
+        numbers = {"margin": least.margin, "margin_time": least.time, "margin_contact": least.contact}
+        phase = replace(phase, **numbers, margin_s=float(phase.traced.table.breaks[0]))
+    failed = next((held for held in phase.holds if held.lost is not None), None)
+    if failed is None or failed.lost is None or (phase.status is not Status.OK and phase.time < failed.lost):
+        return phase
+    return replace(phase, status=Status.CONTACT_LOST, time=failed.lost, contact=failed.contact, slips=False)
 
 
 def _spans(scene: Scene):
@@ -341,7 +425,9 @@ def _spans(scene: Scene):
 
 
 def ending(traced: Traced, phase: Phase, capacity: int) -> str:
-    """Why a wire ends, in words."""
+    """Why a phase ends, in words."""
+    if phase.arrive == "hold":
+        return "the object is held"
     why, index = int(traced.wire.end_why), int(traced.wire.end_contact)
     if why == MADE:
         group, feature = divmod(index, capacity)

@@ -116,10 +116,12 @@ def summary(result: Result, *, bounds: tuple[float, ...] | None = None, **more: 
             "margin_time": phase.margin_time,
             "margin_contact": phase.margin_contact,
             "bound": None if bounds is None else bounds[k],
+            "holds": [_plain(held._asdict()) for held in phase.holds],
             "message": phase.message,
         }
         phases.append(_plain(row))
-    head = {"status": result.status.label, "margin": result.margin, "message": result.message}
+    head = {"status": result.status.label, "margin": result.margin, "hold_margin": result.hold_margin}
+    head["message"] = result.message
     again = {"scene": to_dict(result.scene), "version": version("wholearm_jax")}
     return _plain(head) | {"phases": phases} | _plain(more) | again
 

@@ -98,8 +98,8 @@ class Formation(eqx.Module):
 class Heading(eqx.Module):
     """Which way along the wire, and where to stop before its end.
 
-    Travel starts with the sign `sign` in coordinate number `coordinate`; the phase ends where coordinate number
-    `until_coordinate` reaches `until_value`, or where the formation ends if `until_coordinate` is -1.
+    Travel starts with the sign `sign` in coordinate number `coordinate` (-1: in the one that changes most); the phase
+    ends where coordinate number `until_coordinate` reaches `until_value`, or where the formation ends if that is -1.
     """
 
     coordinate: Int[Array, ""]
@@ -112,7 +112,8 @@ class Phase(eqx.Module):
     """One contact formation held for a while.
 
     `arrive` is `"rest"` (the object must be at rest at the end), `"moving"` (the next phase takes over at speed, by an
-    inelastic impact) or `"caught"` (any speed will do, and is lost before the next phase).
+    inelastic impact), `"caught"` (any speed will do, and is lost before the next phase) or `"hold"` (the object must
+    stay where the phase begins, and its heading means nothing).
     """
 
     name: str = eqx.field(static=True)
@@ -173,12 +174,13 @@ def formation(contacts) -> Formation:
     return Formation(*(jnp.asarray(np.asarray(column)) for column in zip(*rows, strict=True)))
 
 
-def heading(toward: str, until: Mapping[Any, float] | None = None) -> Heading:
-    """Build a `Heading` from a coordinate and a sign (`"x-"`) and an optional `{coordinate: value}` to stop at."""
+def heading(toward: str | None, until: Mapping[Any, float] | None = None) -> Heading:
+    """Build a `Heading` from a coordinate and a sign (`"x-"`; None: either way) and an optional `{coordinate: value}`
+    to stop at."""
     coordinate, value = next(iter(until.items())) if until else (None, 0.0)
     return Heading(
-        coordinate=jnp.asarray(COORDINATES.index(toward[:-1])),
-        sign=jnp.asarray(1.0 if toward[-1] == "+" else -1.0),
+        coordinate=jnp.asarray(COORDINATES.index(toward[:-1]) if toward else -1),
+        sign=jnp.asarray(-1.0 if toward and toward[-1] == "-" else 1.0),
         until_coordinate=jnp.asarray(-1 if coordinate is None else COORDINATES.index(coordinate)),
         until_value=jnp.asarray(float(value)),
     )

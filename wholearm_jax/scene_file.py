@@ -16,6 +16,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    StrictBool,
     Tag,
     ValidationError,
     model_validator,
@@ -165,10 +166,22 @@ def _one_coordinate(until: dict[str, float]) -> dict[str, float]:
 class _Phase(_Strict):
     name: str
     contacts: Annotated[list[str], AfterValidator(_four_constraints)]
-    toward: Annotated[str, AfterValidator(_signed_coordinate)]
+    toward: Annotated[str, AfterValidator(_signed_coordinate)] | None = None
     duration: Positive
     until: Annotated[dict[Coordinate, Finite], AfterValidator(_one_coordinate)] | None = None
-    arrive: Literal["rest", "moving", "caught"] = "rest"
+    arrive: Literal["rest", "moving", "caught"] | None = None
+    hold: StrictBool = False
+
+    def complaint(self, before: Self | None) -> str | None:
+        """The key that does not fit the others, and why; `before` is the phase before this one."""
+        if not self.hold:
+            return "toward: missing"
+        given = next((key for key in ("toward", "until", "arrive") if getattr(self, key) is not None), None)
+        if given is not None:
+            return f"{given}: a phase with hold = true does not move; leave it out"
+        if before is not None and before.arrive == "moving":
+            return f"hold: phase '{before.name}' arrives moving; only an object at rest can be held"
+        return None
 
 
 class _Scene(_Strict):
@@ -186,6 +199,10 @@ class _Scene(_Strict):
         for k, phase in enumerate(self.phase):
             if phase.name in names[:k]:
                 raise ValueError(f"phase[{k}].name: '{phase.name}' stands twice; give each phase its own name")
+            if phase.hold or phase.toward is None:
+                wrong = phase.complaint(self.phase[k - 1] if k else None)
+                if wrong is not None:
+                    raise ValueError(f"phase[{k}].{wrong}")
             for text in phase.contacts:
                 if parse_contact(text)[2] >= count:
                     raise ValueError(f"phase[{k}].contacts: '{text}': the object has vertices 0 to {count - 1}")
@@ -255,16 +272,21 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
         object=polygon(shape.vertices, shape.mass, each, shape.inertia, shape.center_of_mass),
         start=jnp.asarray([getattr(checked.start, c) for c in COORDINATES]),
         phases=tuple(
-            Phase(p.name, formation(p.contacts), heading(p.toward, p.until), jnp.asarray(p.duration), p.arrive)
+            Phase(p.name, formation(p.contacts), heading(p.toward, p.until), jnp.asarray(p.duration), _arrive(p))
             for p in checked.phase
         ),
     )
+
+
+def _arrive(phase: _Phase) -> str:
+    return "hold" if phase.hold else phase.arrive or "rest"
 
 
 _WORDS = {
     "missing": "missing",
     "float_type": "must be a number",
     "finite_number": "must be finite",
+    "bool_type": "must be true or false",
     "string_type": "must be text",
     "list_type": "must be a list",
     "tuple_type": "must be a list",
@@ -329,9 +351,10 @@ def to_dict(scene: Scene) -> dict[str, Any]:
 
 def _phase_dict(phase: Phase) -> dict[str, Any]:
     way = phase.heading
-    row: dict[str, Any] = {
-        "name": phase.name,
-        "contacts": list(phase.formation.names),
+    row: dict[str, Any] = {"name": phase.name, "contacts": list(phase.formation.names)}
+    if phase.arrive == "hold":
+        return row | {"hold": True, "duration": float(phase.duration)}
+    row |= {
         "toward": COORDINATES[int(way.coordinate)] + ("+" if float(way.sign) > 0 else "-"),
         "duration": float(phase.duration),
     }

@@ -98,7 +98,7 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     places = _places(system, heading, march, resolution)
     wire = _cut(system, fixed, march, places, start, resolution)
     touching = residual < 100 * jnp.finfo(rough.dtype).eps
-    direction = jnp.abs(first_tangent[heading.coordinate]) > 1e-6
+    direction = jnp.abs(first_tangent[_leading(heading, first_tangent)]) > 1e-6
     worst = jnp.select(
         [
             ~touching,
@@ -197,7 +197,12 @@ def _null(system, z):
 def _oriented(system, z, heading):
     """The unit tangent at `z` whose coordinate `heading.coordinate` has the sign asked for."""
     null = _null(system, z)
-    return null * jnp.where(null[heading.coordinate] * heading.sign < 0, -1.0, 1.0)
+    return null * jnp.where(null[_leading(heading, null)] * heading.sign < 0, -1.0, 1.0)
+
+
+def _leading(heading, x):
+    """The coordinate that tells which way a wire goes."""
+    return jnp.where(heading.coordinate < 0, jnp.argmax(jnp.abs(x)), heading.coordinate)
 
 
 # --- the march -------------------------------------------------------------------------------------------------------

@@ -1,0 +1,467 @@
+"""Does the prediction hold? Hundreds of random plans, predicted by the model and executed by free bodies in MuJoCo.
+
+    python benchmarks/prediction.py [--stopping 70] [--flying 20] [--seed 0] [--quick]
+
+Plans of two phases that stop between them (`random_plans`) get optimised and quasi-static torques in turn, plans of
+three that do not (`flying_plans`) optimised ones. These are then spoiled. A *squeeze* adds torques along the one
+direction that leaves the motion as it is, as many as move the predicted least force to a place drawn evenly on both
+sides of zero. A *push* adds torques along the other direction, so that the object falls short. Variants are drawn until
+a plan has two that are predicted to hold and two to fail, or the draws are used up. One that is predicted to reach a
+wire's end early, and at speed, is left out: its plan says nothing about the impact that follows.
+
+What counts, by the same tolerances on both sides:
+
+- *predicted to hold*: no contact force turns tensile, no impulse pulls, no hold is infeasible, and every phase ends
+  within `TOLERANCE` (0.5 mm, 0.01 rad) of its wire's end;
+- *executed to hold*: `execution.execute` at 0.2 ms ends `ok` (within the same tolerance, the last contacts closed to
+  0.5 mm), and no contact of a formation was without force for `FREE` running while its phase lasted.
+
+Disagreements are executed again with steps of a quarter, and contacts as much harder, and put into classes.
+"""
+
+import argparse
+import itertools
+import time
+from collections import Counter
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from flying_plans import plans as flying_plans
+from measure import RESULTS, save
+from random_plans import plans as stopping_plans
+
+import wholearm_jax as wa
+from wholearm_jax.execution import Ending, Tolerance, execute
+from wholearm_jax.palette import LINK_COLOURS as COLOURS
+from wholearm_jax.plan import Result, end_configuration, sample
+from wholearm_jax.proportion import wilson
+from wholearm_jax.schedule import padded
+from wholearm_jax.squeeze import coefficients
+from wholearm_jax.status import Status
+
+jax.config.update("jax_enable_x64", True)
+
+KNOTS, TIMESTEP = 51, 2e-4  # [s]
+TOLERANCE = Tolerance()
+FREE = 5e-3  # [s] without force from which a contact counts as lost; shorter is chatter of the contact's softness
+MARGIN_OF_TIME = 0.02  # [s] at either end of a phase, while formations change, in which forces are not judged
+HURRY, EARLY = 0.1, 0.05  # speed over the mean speed, and share of the phase left, with which a wire's end is too early
+EACH, DRAWS = 2, 12  # variants of each kind, and draws, a plan
+PUSHES = 0.25  # share of the draws that push
+SHORT = (0.03, 0.3)  # share of its wire by which a pushed object falls short, about
+CLEAR = 0.05  # distance of the margin from zero, over the mean contact force, from which it is clear
+DIP = 0.02  # [s] of tensile force below which a loss is a short dip
+NEAR = (0.5, 2.0)  # distances from the planned end, over the tolerance, that are near the limit
+NUDGE = 1e-3  # change of all torques that moves the end of a sensitive plan by more than the tolerance
+LAST = 0.03  # share of a phase that is its wire's end
+AROUND, KICK = 0.01, 0.01  # [s] before and after an impact, and share of the speed by which it is off, that count
+PLACES = 1001  # samples a phase
+UNDECIDED = {Status.AMBIGUOUS, Status.SINGULAR, Status.NO_CONVERGENCE, Status.MAX_STEPS}
+
+
+class Predicted(NamedTuple):
+    """What the model says.
+
+    `holds` (None: left out), and the same if forces count only where they are tensile for `FREE` or longer while
+    formations do not change (`lasting`); the least force and the mean force [N]; the longest such time `dip` [s], where
+    the least force is (share of its phase), and how far from the planned end, over the tolerance, the object comes.
+    """
+
+    result: Result
+    courses: list
+    holds: bool | None
+    lasting: bool | None
+    margin: float
+    mean: float
+    dip: float
+    place: float
+    off: float
+
+
+# --- predictions ------------------------------------------------------------------------------------------------------
+
+_coefficients = jax.jit(jax.vmap(coefficients, (None, 0)))
+
+
+def predict(scene: wa.Scene, torque: wa.Torque, traced) -> Predicted:
+    """Simulate a plan and decide, within `TOLERANCE`, whether it holds."""
+    result = wa.simulate(scene, torque, traced=traced)
+    courses = [_course(result, phase) for phase in result.phases]
+    states = [_arrives(*pair) for pair in zip(result.phases, courses, strict=True)]
+    bears = [_bears(phase) for phase in result.phases]
+    lasts = [_lasts(*pair) for pair in zip(result.phases, courses, strict=True)]
+    # What follows a phase that fails is not what would happen: its forces do not count.
+    known = next((k for k, (a, c) in enumerate(zip(states, bears, strict=True)) if not (a and c)), len(states) - 1) + 1
+    undecided = None in states[:known]
+    failed = [[held.margin for held in phase.holds if held.lost is not None] for phase in result.phases]
+    margins = [min([phase.margin, *held]) for phase, held in zip(result.phases, failed, strict=True)]
+    worst = int(np.argmin(margins[:known]))
+    phase, course = result.phases[worst], courses[worst]
+    return Predicted(
+        result=result,
+        courses=courses,
+        holds=None if undecided else all(states) and all(bears),
+        lasting=None if undecided else all(states) and all(lasts),
+        margin=margins[worst],
+        mean=float(np.nanmean(np.concatenate([c.cn.ravel() for c in courses[:known]]))),
+        dip=max(_dip(course) for course in courses[:known]),
+        place=(phase.margin_time - phase.start) / max(float(course.time[-1] - phase.start), 1e-9),
+        off=max(_off(*pair) for pair in zip(result.phases[:known], courses[:known], strict=True)),
+    )
+
+
+def _dip(course) -> float:
+    """The longest time [s] for which one of a phase's forces is tensile where executed ones are judged as well."""
+    begin, end = course.time[0] + MARGIN_OF_TIME, course.time[-1] - MARGIN_OF_TIME
+    cn = course.cn[(course.time >= begin) & (course.time <= end)]
+    step = float(course.time[1] - course.time[0])
+    return max(_longest(cn[:, k] < 0) for k in range(cn.shape[1])) * step
+
+
+def _bears(phase) -> bool:
+    """Whether no contact of a phase would have to pull."""
+    return phase.contact is None and phase.status is not Status.CONTACT_LOST and bool(np.isfinite(phase.margin))
+
+
+def _lasts(phase, course) -> bool:
+    """Whether no contact of a phase would have to pull for `FREE` or longer, while formations do not change."""
+    pulls = bool(phase.impulses) and min(phase.impulses) < 0
+    refused = pulls or any(held.lost is not None for held in phase.holds)
+    return _bears(phase) or (phase.status is Status.CONTACT_LOST and not refused and _dip(course) < FREE)
+
+
+def _off(phase, course) -> float:
+    """How far from its wire's end a phase ends, over the tolerance."""
+    off = np.asarray(course.z[-1] - end_configuration(phase.traced))
+    return float(max(np.hypot(*off[:2]) / TOLERANCE.position, abs(off[2]) / TOLERANCE.angle))
+
+
+def _course(result, phase):
+    """A phase at `PLACES` times until its motion ends, also beyond the loss of a contact."""
+    outcome, motion = phase.outcome, phase.outcome.motion
+    shares = jnp.linspace(0.0, motion.share[motion.count], PLACES)
+    schedule = padded(result.torque)
+    return jax.device_get(sample(phase.traced.table, schedule, outcome.start, outcome.duration, motion, shares))
+
+
+def _arrives(phase, course) -> bool | None:
+    """Whether a phase ends where it should; None where its plan does not say what follows.
+
+    That is so where it comes to its end too early, or where it should have passed on at speed and is merely late.
+    """
+    motion = phase.outcome.motion
+    ended, length = Status(int(motion.status)), float(phase.traced.table.length)
+    share, pace = (float(values[int(motion.count)]) for values in (motion.share, motion.w / length))
+    if {ended, phase.status} & UNDECIDED:
+        return None
+    there = _off(phase, course) <= 1
+    if phase.arrive == "moving":
+        return None if ended is Status.OK and not there else there
+    if there and (pace > HURRY or share < 1 - EARLY):
+        return None
+    return there
+
+
+# --- torques ----------------------------------------------------------------------------------------------------------
+
+
+def base_torques(scene: wa.Scene, traced, optimised: bool) -> wa.Torque:
+    """The optimised or the quasi-static torques of a plan."""
+    if optimised:
+        return wa.optimise(scene, knots=KNOTS, traced=traced).torque
+    return wa.quasistatic(scene, knots=KNOTS, traced=traced)
+
+
+def spoiled(base: Predicted, rng: np.random.Generator) -> tuple[str, wa.Torque] | None:
+    """A variant of the torques, and which kind it is; None where the drawn squeeze does not reach its aim."""
+    torque, row_of = base.result.torque, _rows(base.result)
+    change = np.zeros((len(torque.times), 2))
+    chosen = int(rng.integers(len(base.courses)))
+    rows = row_of == chosen
+    course, table = base.courses[chosen], base.result.phases[chosen].traced.table
+    s = np.interp(np.asarray(torque.times)[rows], course.time, course.s)
+    pull = np.asarray(_coefficients(table, jnp.asarray(np.resize(s, 4 * KNOTS)))[0])[: rows.sum(), 3:]
+    if rng.random() < PUSHES:
+        duration, size = float(base.result.phases[chosen].duration), (pull**2).sum(1, keepdims=True)
+        back = 2 * rng.uniform(*SHORT) * float(table.length) / duration**2
+        change[rows] = -back * pull / size
+        return "push", wa.Torque(torque.times, torque.values + change)
+    amount = _squeeze(base, chosen, rng)
+    if amount is None:
+        return None
+    change[rows] = amount * np.stack([-pull[:, 1], pull[:, 0]], axis=1) / np.linalg.norm(pull, axis=1, keepdims=True)
+    return "squeeze", wa.Torque(torque.times, torque.values + change)
+
+
+def _rows(result: Result) -> np.ndarray:
+    """The phase that each row of a schedule belongs to, by when its phases begin."""
+    times = np.asarray(result.torque.times)
+    if all(phase.arrive == "rest" for phase in result.phases):
+        return np.arange(len(times)) // KNOTS
+    return np.searchsorted([phase.start for phase in result.phases], times, side="right") - 1
+
+
+def _squeeze(base: Predicted, chosen: int, rng: np.random.Generator) -> float | None:
+    """How much squeeze, in a direction drawn, moves the least force of a phase to a place drawn about zero."""
+    course, phase = base.courses[chosen], base.result.phases[chosen]
+    motion, force = (np.asarray(a) for a in _coefficients(phase.traced.table, jnp.asarray(course.s)))
+    free = np.stack([-motion[:, 4], motion[:, 3]], axis=1) / np.linalg.norm(motion[:, 3:], axis=1, keepdims=True)
+    count = np.isfinite(course.cn).all(0).sum() if np.isfinite(course.cn).any() else 4
+    slope = np.einsum("pit,pt->pi", force[:, :count, 3:], free)
+    cn = course.cn[:, :count]
+    moving = np.isfinite(cn).all(1)
+    if count < 4 or not moving.any():
+        return None
+    aim, sign = base.margin * rng.uniform(-1.0, 0.9), rng.choice([-1.0, 1.0])
+
+    def least(amount):
+        return (cn + sign * amount * slope)[moving].min()
+
+    high = 0.01
+    while least(high) > aim:
+        high *= 2
+        if high > 3:
+            return None
+    low = 0.0
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if least(middle) > aim else (low, middle)
+    return float(sign * high)
+
+
+# --- executions -------------------------------------------------------------------------------------------------------
+
+
+def executed(predicted: Predicted, timestep: float = TIMESTEP) -> dict:
+    """One execution: whether it holds, where it ends, and the longest time that a contact was without force."""
+    done = execute(predicted.result, timestep=timestep, tolerance=TOLERANCE)
+    free, which = 0.0, None
+    for phase, course in zip(predicted.result.phases, predicted.courses, strict=True):
+        begin, end = phase.start + MARGIN_OF_TIME, float(course.time[-1]) - MARGIN_OF_TIME
+        inside = (done.course.time >= begin) & (done.course.time <= end)
+        for name in phase.contacts:
+            longest = _longest(done.course.cn[inside, done.names.index(name)] <= 0) * done.timestep
+            if longest > free:
+                free, which = longest, name
+    holds = done.ending is Ending.OK and free < FREE
+    errors = {"position_error": done.position_error, "angle_error": abs(done.angle_error)}
+    found = {"holds": holds, "ending": done.ending.value, "free": free, "free_contact": which, **errors}
+    changes = [phase.start for phase in predicted.result.phases if any(phase.impulses)]
+    return found | {"impact": max((_impact(done, when) for when in changes), default=0.0)}
+
+
+def _impact(done, when: float) -> float:
+    """By how much more of its speed an executed object is off the prediction after a change than before it."""
+
+    def off(time):
+        pair = [
+            np.stack([np.interp(time, c.time, c.z_dot[:, k]) for k in range(5)]) for c in (done.course, done.expected)
+        ]
+        return np.linalg.norm(pair[0] - pair[1]) / max(np.linalg.norm(pair[1]), 1e-9)
+
+    return float(off(when + AROUND) - off(when - AROUND))
+
+
+def _longest(flags) -> int:
+    """The length of the longest run of True."""
+    return max((len(list(group)) for flag, group in itertools.groupby(flags.tolist()) if flag), default=0)
+
+
+# --- the study --------------------------------------------------------------------------------------------------------
+
+
+def variants(scene: wa.Scene, optimised: bool, rng: np.random.Generator) -> Iterator[tuple[str, Predicted]]:
+    """Up to `EACH` variants of a plan that are predicted to hold, and as many that are not."""
+    traced = wa.trace(scene)
+    base = predict(scene, base_torques(scene, traced, optimised), traced)
+    wanted = {True: EACH, False: EACH}
+    if base.holds is not None:
+        wanted[base.holds] -= 1
+        yield "as found", base
+    for _ in range(DRAWS if base.holds else 0):
+        drawn = spoiled(base, rng)
+        if drawn is None:
+            continue
+        predicted = predict(scene, drawn[1], traced)
+        if predicted.holds is None:
+            yield "left out", predicted
+        elif wanted[predicted.holds]:
+            wanted[predicted.holds] -= 1
+            yield drawn[0], predicted
+
+
+def row_of(kind: str, predicted: Predicted, found: dict) -> dict:
+    """A plan's outcome, and the class of a disagreement."""
+    first = next((p for p in predicted.result.phases if p.status is not Status.OK), None)
+    row = {
+        "kind": kind,
+        "predicted": predicted.holds,
+        "lasting": predicted.lasting,
+        "status": "ok" if first is None else first.status.label,
+        "contact": None if first is None else first.contact,
+        "margin": predicted.margin,
+        "mean_force": predicted.mean,
+        "dip": predicted.dip,
+        "place": predicted.place,
+        "off": predicted.off,
+        "executed": found,
+    }
+    if predicted.holds != found["holds"]:
+        finer = executed(predicted, TIMESTEP / 4)
+        row |= {"finer": finer, "class": explain(predicted, found, finer)}
+    return row
+
+
+def explain(predicted: Predicted, found: dict, finer: dict) -> str:
+    """Why prediction and execution disagree: the first that applies."""
+    lost = -np.inf < predicted.margin < 0
+    if finer["holds"] == predicted.holds:
+        return "softness: agrees with steps of a quarter"
+    if lost and predicted.dip < FREE:
+        return f"tensile for less than {1e3 * FREE:g} ms, or only while formations change"
+    if lost and predicted.dip < DIP:
+        return f"tensile for {1e3 * FREE:g} to {1e3 * DIP:g} ms"
+    if abs(predicted.margin) < CLEAR * predicted.mean:
+        return "margin within 5 % of the mean force of zero"
+    if lost and (predicted.place > 1 - LAST or predicted.place < LAST):
+        return "at the wire's end"
+    apart = max(found["position_error"] / TOLERANCE.position, found["angle_error"] / TOLERANCE.angle)
+    if not lost and NEAR[0] <= max(predicted.off, apart) <= NEAR[1]:
+        return "the end is near the tolerance's limit"
+    if finer["impact"] > KICK:
+        return "impact: the speed after a change of formation is off by more than 1 %"
+    return "sensitive: 0.1 % of the torque moves the end as far" if _sensitive(predicted) else "unexplained"
+
+
+def _sensitive(predicted: Predicted) -> bool:
+    """Whether a small change of the torques moves the predicted end of a phase by more than the tolerance."""
+    result = predicted.result
+    traced = tuple(phase.traced for phase in result.phases)
+    for factor in (1 - NUDGE, 1 + NUDGE):
+        torque = wa.Torque(result.torque.times, factor * result.torque.values)
+        other = wa.simulate(result.scene, torque, traced=traced)
+        for one, phase in zip(predicted.courses, other.phases, strict=True):
+            moved = np.asarray(_course(other, phase).z[-1] - one.z[-1])
+            if np.hypot(*moved[:2]) > TOLERANCE.position or abs(moved[2]) > TOLERANCE.angle:
+                return True
+    return False
+
+
+def _plans(seed: int, stopping: int, flying: int) -> Iterator[tuple[str, wa.Scene]]:
+    """Plans of both kinds, mixed."""
+    left = {"stopping": stopping, "flying": flying}
+    found = {"stopping": stopping_plans(np.random.default_rng(seed), 2, 1.0)}
+    found["flying"] = flying_plans(np.random.default_rng(seed), 3, 0.4)
+    while any(left.values()):
+        kind = max(left, key=lambda kind: left[kind] / max({"stopping": stopping, "flying": flying}[kind], 1))
+        left[kind] -= 1
+        yield kind, next(found[kind])
+
+
+def study(scenes, seed: int, begun: float, note) -> tuple[list[dict], int]:
+    """All variants of all plans."""
+    rng, rows, left_out = np.random.default_rng(seed), [], 0
+    for number, (sort, scene) in enumerate(scenes):
+        for kind, predicted in variants(scene, sort == "flying" or number % 2 == 0, rng):
+            if kind == "left out":
+                left_out += 1
+                continue
+            row = {"plan": f"{sort}: {scene.title}"} | row_of(kind, predicted, executed(predicted))
+            rows.append(row)
+            agrees = "" if "class" not in row else f"  DISAGREES: {row['class']}"
+            margin = f"{row['margin']:7.3f} N of {row['mean_force']:.2f} N"
+            print(f"{number:3d} {kind:9s} {row['status']:13s} {margin}  {row['executed']}{agrees}", flush=True)
+        if number % 5 == 4:
+            note(rows, left_out)
+        print(f"    {time.perf_counter() - begun:.0f} s, {len(rows)} executions", flush=True)
+    return rows, left_out
+
+
+def summarise(rows: list[dict]) -> dict:
+    """The confusion matrix and the rates of agreement with Wilson's 95 % intervals."""
+    pairs = Counter((row["predicted"], row["executed"]["holds"]) for row in rows)
+    names = {True: "holds", False: "fails"}
+    matrix = {f"predicted {names[p]}, executed {names[e]}": pairs[p, e] for p in names for e in names}
+
+    def rate(chosen):
+        agreed = sum(row.get("agrees", "class" not in row) for row in chosen)
+        interval = wilson(agreed, len(chosen)) if chosen else (0.0, 1.0)
+        return {"agreed": agreed, "of": len(chosen), "rate": agreed / max(len(chosen), 1), "interval_95": interval}
+
+    clear = [row for row in rows if abs(row["margin"]) > CLEAR * row["mean_force"]]
+    short = [row | {"agrees": row["lasting"] == row["executed"]["holds"]} for row in rows]
+    short_clear = [row for row in short if abs(row["margin"]) > CLEAR * row["mean_force"]]
+    by_sort = {
+        f"{sort}, {name}": rate([row for row in some if row["plan"].startswith(sort)])
+        for sort in ("stopping", "flying")
+        for name, some in (("overall", rows), ("clear", clear))
+    }
+    classes = Counter(row["class"] for row in rows if "class" in row)
+    clear_classes = Counter(row["class"] for row in clear if "class" in row)
+    by_kind = {kind: rate([row for row in rows if row["kind"] == kind]) for kind in sorted({r["kind"] for r in rows})}
+    return {
+        "confusion": matrix,
+        "overall": rate(rows),
+        "clear": rate(clear),
+        "lasting_overall": rate(short),
+        "lasting_clear": rate(short_clear),
+        "by_kind": by_kind,
+        "by_sort": by_sort,
+        "disagreements": dict(classes),
+        "clear_disagreements": dict(clear_classes),
+    }
+
+
+def draw(rows: list[dict]) -> plt.Figure:
+    """How long a contact was without force, and how far off the end was, against the predicted margin."""
+    figure, axes = plt.subplots(1, 2, figsize=(8.6, 3.6), sharex=True, layout="constrained")
+    for predicted, colour, mark in ((True, COLOURS[0], "o"), (False, COLOURS[1], "x")):
+        for agrees, size in ((True, 12), (False, 40)):
+            shown = [r for r in rows if r["predicted"] is predicted and ("class" not in r) is agrees]
+            at = [r["margin"] / r["mean_force"] for r in shown]
+            label = f"predicted to {'hold' if predicted else 'fail'}{'' if agrees else ', executed otherwise'}"
+            style = {"s": size, "marker": mark, "color": colour, "linewidths": 0.7 if agrees else 1.8, "label": label}
+            axes[0].scatter(at, [1e3 * max(r["executed"]["free"], 1e-4) for r in shown], **style)
+            axes[1].scatter(at, [1e3 * max(r["executed"]["position_error"], 1e-7) for r in shown], **style)
+    limits = (("longest time without force [ms]", 1e3 * FREE), ("distance from the planned end [mm]", 0.5))
+    for ax, (label, limit) in zip(axes, limits, strict=True):
+        ax.axhline(limit, color="#222222", lw=0.8, ls=":")
+        ax.axvspan(-CLEAR, CLEAR, color="#dddddd", lw=0, zorder=0)
+        ax.set_yscale("log")
+        ax.set_ylabel(label)
+        ax.set_xlabel("predicted least force, over the mean force")
+        ax.spines[["top", "right"]].set_visible(False)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=8)
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--stopping", type=int, default=70, help="plans of two phases")
+    parser.add_argument("--flying", type=int, default=20, help="plans of three phases without a stop")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--quick", action="store_true", help="a few plans; nothing is written")
+    given = parser.parse_args()
+    stopping, flying = (3, 1) if given.quick else (given.stopping, given.flying)
+    begun = time.perf_counter()
+
+    def note(rows, left_out):
+        if not given.quick:
+            counts = {"plans": len({row["plan"] for row in rows}), "executions": len(rows), "left_out": left_out}
+            limits = {"free": FREE, "timestep": TIMESTEP, **TOLERANCE._asdict(), "clear": CLEAR}
+            save("prediction", {"seed": given.seed, **counts, **limits, **summarise(rows), "rows": rows})
+            draw(rows).savefig(RESULTS / "prediction.svg", bbox_inches="tight")
+            plt.close("all")
+
+    rows, left_out = study(_plans(given.seed, stopping, flying), given.seed, begun, note)
+    note(rows, left_out)
+    for name, value in summarise(rows).items():
+        print(name, value)
+
+
+if __name__ == "__main__":
+    main()
