@@ -17,6 +17,7 @@ LARGEST = 500_000  # bytes of a notebook with its outputs
 def compiled(tmp_path_factory):
     """Kernels share compiled programs, of all workers, unless the environment says where they are kept already."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("MPLBACKEND", raising=False)  # the command line's choice, once a test has run it in this process
         if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
             base = tmp_path_factory.getbasetemp()
             shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "compiled"
