@@ -40,7 +40,7 @@ def start(command, store: Path, *more: str) -> subprocess.Popen:
 
 def finish(process: subprocess.Popen) -> str:
     """Wait for success; what it said."""
-    said, _ = process.communicate(timeout=300)
+    said, _ = process.communicate(timeout=900)
     assert process.returncode == 0, said
     return said
 
