@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from random_plans import FRICTION, MASS, _grasps, _polygon, write
+from random_plans import _grasps, random_object, write
 
 import wholearm_jax as wa
 from wholearm_jax.formations import Way, leaving, ways
@@ -38,11 +38,7 @@ def plans(rng: np.random.Generator, phases: int, pace: float) -> Iterator[wa.Sce
     """One plan after another, without end."""
     hand = to_dict(wa.load("heptagon"))["hand"]
     for number in itertools.count():
-        shape = {
-            "vertices": _polygon(rng).tolist(),
-            "mass": round(rng.uniform(*MASS), 2),
-            "friction": round(rng.uniform(*FRICTION), 2),
-        }
+        shape = random_object(rng)
         found = (plan for grasp in _grasps(rng, shape["vertices"], hand) for plan in _from(grasp, shape, hand, phases))
         chain = next(found, None)
         if chain is not None:

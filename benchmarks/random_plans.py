@@ -52,11 +52,7 @@ def plans(rng: np.random.Generator, phases: int, duration: float) -> Iterator[wa
     """One plan after another, without end."""
     hand = to_dict(wa.load("heptagon"))["hand"]
     for number in itertools.count():
-        shape = {
-            "vertices": _polygon(rng).tolist(),
-            "mass": round(rng.uniform(*MASS), 2),
-            "friction": round(rng.uniform(*FRICTION), 2),
-        }
+        shape = random_object(rng)
         for start, contacts in _grasps(rng, shape["vertices"], hand):
             data = {"title": "", "gravity": 9.81, "hand": hand, "object": shape, "start": start, "phase": []}
             found = _plan(data, contacts, phases, duration)
@@ -67,6 +63,15 @@ def plans(rng: np.random.Generator, phases: int, duration: float) -> Iterator[wa
 
 
 # --- polygons and grasps: plane geometry ------------------------------------------------------------------------------
+
+
+def random_object(rng: np.random.Generator) -> dict[str, Any]:
+    """The `object` of a scene file: a random polygon with its mass and friction."""
+    return {
+        "vertices": _polygon(rng).tolist(),
+        "mass": round(rng.uniform(*MASS), 2),
+        "friction": round(rng.uniform(*FRICTION), 2),
+    }
 
 
 def _polygon(rng: np.random.Generator) -> np.ndarray:

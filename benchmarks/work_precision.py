@@ -105,7 +105,7 @@ def problems(*, referred: bool) -> list[Problem]:
 def _problem(scene, traced, phase, kind, unreduced, referred) -> Problem:
     given = wa.read_torque(HERE / "data" / f"heptagon_{kind}.csv")
     start, duration = jnp.asarray(float(phase)), jnp.asarray(float(scene.phases[phase].duration))
-    schedule = jax.jit(padded)(given)
+    schedule = padded(given)
     outcome = plan.run(traced[phase].table, schedule, start, duration, Integration(tolerance=1e-13), "moving")
     assert not bool(outcome.motion.held[0]), "the references do not wait"
     end = float(outcome.motion.share[int(outcome.motion.count)])

@@ -1,16 +1,17 @@
 """Every test computes in 64 bits, compiles as the command line does, and leaves room for those that follow."""
 
+import sys
 from pathlib import Path
 
 import jax
 import pytest
 
-from wholearm_jax.command import compile_quickly
+from wholearm_jax import command
 
 MAPPED = 30_000  # half of the memory areas that Linux grants a process by default
 
 jax.config.update("jax_enable_x64", True)
-compile_quickly()
+command.compile_quickly()
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -28,3 +29,18 @@ def _room_for_programs():
     areas = Path("/proc/self/maps")
     if areas.exists() and len(areas.read_bytes().splitlines()) > MAPPED:
         jax.clear_caches()
+
+
+@pytest.fixture
+def wholearm(monkeypatch, capsys):
+    """Run the program in this process: arguments -> (exit status, standard output, standard error)."""
+    monkeypatch.setenv("JAX_ENABLE_COMPILATION_CACHE", "true")  # leave the user's cache folder alone
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["wholearm", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            command.main()
+        printed = capsys.readouterr()
+        return caught.value.code or 0, printed.out, printed.err
+
+    return run

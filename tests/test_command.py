@@ -8,23 +8,7 @@ import sys
 import pytest
 import tomli_w
 
-from wholearm_jax import command
 from wholearm_jax.scene_file import bundled, load, to_dict
-
-
-@pytest.fixture
-def wholearm(monkeypatch, capsys):
-    """Run the program in this process: arguments -> (exit status, standard output, standard error)."""
-    monkeypatch.setenv("JAX_ENABLE_COMPILATION_CACHE", "true")  # leave the user's cache folder alone
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["wholearm", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            command.main()
-        printed = capsys.readouterr()
-        return caught.value.code or 0, printed.out, printed.err
-
-    return run
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ from matplotlib.path import Path as Outline
 from scipy.stats import binomtest
 
 import wholearm_jax as wa
-from wholearm_jax import command
 from wholearm_jax.contacts import contacts, frames
 from wholearm_jax.drawing import animate, draw_execution, draw_execution_strip
 from wholearm_jax.execution import Ending, Tolerance, clock, drive, execute, start_of
@@ -227,21 +226,6 @@ def test_figures(executions, tmp_path):
     animate(done, 2).save(tmp_path / "motion.gif", writer="pillow")
     assert (tmp_path / "motion.gif").stat().st_size > 5_000
     plt.close("all")
-
-
-@pytest.fixture
-def wholearm(monkeypatch, capsys):
-    """Run the program in this process: arguments -> (exit status, standard output, standard error)."""
-    monkeypatch.setenv("JAX_ENABLE_COMPILATION_CACHE", "true")
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["wholearm", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            command.main()
-        printed = capsys.readouterr()
-        return caught.value.code or 0, printed.out, printed.err
-
-    return run
 
 
 TORQUE = ("--torque", DATA / "heptagon_torque.csv")

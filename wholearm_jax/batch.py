@@ -24,6 +24,7 @@ from wholearm_jax.plan import (
     Result,
     Traced,
     end_configuration,
+    final_configuration,
     joined,
     prepare,
     require_covered,
@@ -32,7 +33,6 @@ from wholearm_jax.plan import (
     run,
     simulate,
 )
-from wholearm_jax.reduction import horner, powers
 from wholearm_jax.scene import Formation, Heading, Scene, body
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.status import Status
@@ -272,7 +272,6 @@ def _stop(traced: Traced, done: Outcome, formation: Formation, level: Level) -> 
     table, motion = traced.table, done.motion
     known = jnp.isfinite(done.score.margin) & (table.status == 0)
     of_slot = jnp.cumsum(~formation.tangential) - 1
-    panel, xi = powers(table, motion.piece[jnp.maximum(motion.count - 1, 0)], motion.s[motion.count])
     status, contact = done.verdict.status, done.verdict.contact
     worth = (status != int(Status.MAX_STEPS)) & (status != int(Status.NO_CONVERGENCE))
     fine = (table.error <= level.error) & (table.count < level.resolution.pieces)
@@ -283,7 +282,7 @@ def _stop(traced: Traced, done: Outcome, formation: Formation, level: Level) -> 
         margin_contact=of_slot[done.score.contact],
         time=done.start + done.duration * done.verdict.share,
         contact=jnp.where(contact >= 0, of_slot[contact], -1),
-        end=jnp.where(table.status == 0, horner(table.configuration[panel], xi), jnp.nan),
+        end=jnp.where(table.status == 0, final_configuration(table, motion), jnp.nan),
         good=jnp.where(table.status == 0, fine & worth, worth),
     )
 
@@ -302,8 +301,7 @@ def from_result(result: Result) -> Checked:
     p = rows[where]
     named = p.margin_contact if failed is None else p.contact
     table, motion = last.traced.table, last.outcome.motion
-    panel, xi = powers(table, motion.piece[jnp.maximum(motion.count - 1, 0)], motion.s[motion.count])
-    end = horner(table.configuration[panel], xi) if int(table.status) == Status.OK else jnp.full(5, jnp.nan)
+    end = final_configuration(table, motion) if int(table.status) == Status.OK else jnp.full(5, jnp.nan)
     return Checked(
         status=np.asarray(int(result.status)),
         margin=np.asarray(result.margin),

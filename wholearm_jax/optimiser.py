@@ -320,7 +320,7 @@ def _compile(phases: int, knots: int, rows: int, method) -> None:
     p = Variables(*(jnp.asarray(a) for a in empty))
     advance(begin(p, method), tables, limits, _HOW, method)
     zero, one = jnp.asarray(np.zeros(())), jnp.asarray(_ONE)
-    run(table, _padded(_evenly(1.0, empty[0][0]), rows), zero, one, Integration(), "rest")
+    run(table, padded(_evenly(1.0, empty[0][0]), rows), zero, one, Integration(), "rest")
 
 
 @functools.cache
@@ -336,9 +336,6 @@ LOST = 1e-6  # share of a step at which a descent gives up
 
 def _evenly(duration, values) -> Torque:
     return Torque(jnp.asarray(np.linspace(0.0, float(duration), len(values))), jnp.asarray(values))
-
-
-_padded = jax.jit(padded, static_argnames="multiple")
 
 
 @jax.jit
@@ -357,7 +354,7 @@ def _honest(scene: Scene, task: _Task, p: Variables) -> tuple[bool, float]:
     """Whether a simulation of the schedules says `ok`, holds included, and the least margin over its bound."""
     start, shares, fine, arriving = 0.0, [], [], None
     torque = _in_turn(_schedules(task, p))
-    schedule = _padded(torque, task.rows)
+    schedule = padded(torque, task.rows)
     ends = np.cumsum(np.exp(np.asarray(p.log_duration)))
     for phase, at, end, top in zip(task.phases, task.traced, ends, task.bounds, strict=True):
         one = run(at.table, schedule, start, end - start, Integration(), phase.arrive, arriving)

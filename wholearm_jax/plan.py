@@ -13,14 +13,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from wholearm_jax.forces import Score, arcs, force, on_arc, score
 from wholearm_jax.holding import Departure, Held, Statics, statics, watch
 from wholearm_jax.motion import Integration, Motion, move
 from wholearm_jax.reduction import Change, Table, change, horner, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, body, contact_name
-from wholearm_jax.schedule import Torque, has_steps, padded, window
+from wholearm_jax.schedule import Torque, has_steps, padded, rounded, window
 from wholearm_jax.status import Status
 from wholearm_jax.system import system
 from wholearm_jax.verdict import ARRIVAL, GOALS, Verdict, judge
@@ -165,22 +165,28 @@ def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integra
     return Outcome(start, duration, entered, motion, scored, verdict, leaving)
 
 
-_padded = jax.jit(padded, static_argnames="multiple")
+@jax.jit
+def configuration(table: Table, piece: Int[Array, ""], s: Float[Array, ""]) -> Float[Array, "5"]:
+    """`z` (SI) at a place of a wire."""
+    panel, xi = powers(table, piece, s)
+    return horner(table.configuration[panel], xi)
 
 
 @jax.jit
 def end_configuration(traced: Traced) -> Float[Array, "5"]:
     """`z` (SI) where a wire ends."""
-    table = traced.table
-    panel, xi = powers(table, table.count - 1, table.breaks[-1])
-    return horner(table.configuration[panel], xi)
+    return configuration(traced.table, traced.table.count - 1, traced.table.breaks[-1])
 
 
 @jax.jit
 def start_configuration(table: Table) -> Float[Array, "5"]:
     """`z` (SI) where a wire starts."""
-    panel, xi = powers(table, jnp.asarray(0), table.breaks[0])
-    return horner(table.configuration[panel], xi)
+    return configuration(table, jnp.asarray(0), table.breaks[0])
+
+
+def final_configuration(table: Table, motion: Motion) -> Float[Array, "5"]:
+    """`z` (SI) where a motion has come to."""
+    return configuration(table, motion.piece[jnp.maximum(motion.count - 1, 0)], motion.s[motion.count])
 
 
 def destination(phase: Phase, traced: Traced) -> Float[Array, "5"]:
@@ -226,8 +232,7 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
 @jax.jit
 def joined(traced: Traced, rough) -> Traced:
     """Refuse a phase whose formation does not hold where the phase before it ended."""
-    panel, xi = powers(traced.table, jnp.asarray(0), traced.table.breaks[0])
-    apart = jnp.abs(horner(traced.table.configuration[panel], xi) - rough).max()
+    apart = jnp.abs(start_configuration(traced.table) - rough).max()
     status = traced.table.status
     open_there = (status == 0) & ~(apart < CONTINUITY)
     return eqx.tree_at(lambda t: t.table.status, traced, jnp.where(open_there, int(Status.NO_CONVERGENCE), status))
@@ -265,7 +270,7 @@ def outcomes(
 ) -> tuple[Outcome, ...]:
     """Simulate every phase; differentiable, and usable under any JAX transformation."""
     zero = jnp.zeros((), torque.times.dtype)
-    schedule, start, planned, still, found = _padded(torque), zero, zero, jnp.zeros(5, zero.dtype), []
+    schedule, start, planned, still, found = padded(torque), zero, zero, jnp.zeros(5, zero.dtype), []
     arriving = still
     for phase, at in zip(scene.phases, traced, strict=True):
         planned = planned + phase.duration
@@ -394,16 +399,10 @@ def stays(scene: Scene, torque: Torque, phase: Phase, traced: Traced, outcome: O
     start, duration = float(outcome.start), float(outcome.duration)
     found = []
     for k in np.flatnonzero(motion.held[: int(motion.count)]):
-        z = _configuration(traced.table, motion.piece[k], motion.s[k])
+        z = configuration(traced.table, motion.piece[k], motion.s[k])
         begin, end = (start + duration * float(share) for share in motion.share[k : k + 2])
         found.append(watch(statics(scene, phase.formation, z), torque, begin, end))
     return tuple(found)
-
-
-@jax.jit
-def _configuration(table: Table, piece, s):
-    panel, xi = powers(table, piece, s)
-    return horner(table.configuration[panel], xi)
 
 
 def _with_holds(phase: PhaseResult) -> PhaseResult:
@@ -496,7 +495,7 @@ def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
     >>> [f"{t:.2f}" for t in first.time.tolist()], first.cn.shape
     (['0.00', '0.25', '0.50', '0.75', '1.00'], (5, 4))
     """
-    found, schedule, rows = [], _padded(result.torque), -(-samples // SAMPLED) * SAMPLED
+    found, schedule, rows = [], padded(result.torque), rounded(samples, SAMPLED)
     for phase in result.phases:
         if int(phase.traced.table.status) != Status.OK:
             break

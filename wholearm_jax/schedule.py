@@ -1,6 +1,9 @@
 """Torque schedules: two joint torques over time, linear between rows; a repeated time is a step."""
 
+from functools import partial
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -64,6 +67,7 @@ def rounded(rows: int, multiple: int = 64) -> int:
     return -(-rows // multiple) * multiple
 
 
+@partial(jax.jit, static_argnames="multiple")
 def padded(schedule: Torque, multiple: int = 64) -> Torque:
     """The same schedule with its last row repeated, so that schedules of like length share a compiled program."""
     missing = rounded(schedule.times.shape[0], multiple) - schedule.times.shape[0]
