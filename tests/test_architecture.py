@@ -10,7 +10,7 @@ from wholearm_jax import plan
 
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
-    *("status", "scene", "contacts", "system", "elimination", "newton", "wire", "reduction"),
+    *("status", "scene", "contacts", "system", "elimination", "newton", "programs", "wire", "reduction"),
     *("schedule", "motion", "forces", "verdict", "holding", "plan", "gradient_check"),
     *("squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),
@@ -65,6 +65,6 @@ def test_scenes_of_one_size_share_their_programs():
         scene = wa.load(name)
         with jax.log_compiles(False):
             wa.simulate(scene, wa.quasistatic(scene))
-        sizes = (plan.prepare._cached._cache_size(), plan._run._cached._cache_size())
+        sizes = (plan.prepare.plain._cached._cache_size(), plan._run.plain._cached._cache_size())
         count(sizes)
     assert len(compiled) == 1, f"a later scene compiled again: {compiled}"

@@ -15,6 +15,7 @@ import typer
 
 from wholearm_jax.arguments import BadInput, SceneName, TorqueFile
 from wholearm_jax.batch_command import ARRIVAL, check, ensemble, optimise_robustly
+from wholearm_jax.programs import keep
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -52,8 +53,10 @@ def _keep_compiled() -> None:
     if jax.config.values["jax_compilation_cache_dir"] is not None or "JAX_ENABLE_COMPILATION_CACHE" in os.environ:
         return
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    jax.config.update("jax_compilation_cache_dir", os.path.join(home, "wholearm_jax"))
+    folder = os.path.join(home, "wholearm_jax")
+    jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    keep(Path(folder, "programs"))
 
 
 def compile_quickly() -> None:

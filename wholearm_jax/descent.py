@@ -29,6 +29,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.forces import smooth_margin, spare
 from wholearm_jax.motion import Integration
+from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Table, change, horner, powers
 from wholearm_jax.shooting import PARTS, ROWS, SAMPLES, STEPS, Variables, local, shoot
 from wholearm_jax.squeeze import coefficients
@@ -396,14 +397,14 @@ class Descent(NamedTuple):
     apart: Float[Array, ""]
 
 
-@eqx.filter_jit
+@Program
 def begin(p: Variables, optimiser) -> Descent:
     """A descent before its first step."""
     zero, still = jnp.zeros(()), jax.tree.map(jnp.zeros_like, p)
     return Descent(p, optimiser.init(ravel_pytree(p)[0]), p, still, zero + 1, 0 * p.log_duration, zero)
 
 
-@eqx.filter_jit
+@Program
 def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimiser) -> Descent:
     """Simulate, and take a step; where `d.p` cannot be simulated, go back and take a shorter one."""
     linear = linearise(d.p, tables, limits, how)

@@ -363,6 +363,8 @@ def save_figure(draw: Callable[[], Any], folder: Path, name: str) -> None:
     """Draw with the settings of a paper; write it to look at, and as vectors for the web and for print."""
     with plt.rc_context(PAPER):
         figure = np.ravel(draw())[0].figure
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # laid out once is enough for every format
         for kind, undated in (("png", {}), ("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
             buffer = io.BytesIO()
             figure.savefig(buffer, format=kind, dpi=250, bbox_inches="tight", metadata=undated)

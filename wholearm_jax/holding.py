@@ -19,7 +19,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.optimize import linprog
 
 from wholearm_jax.contacts import normal_rows, slip_rows
 from wholearm_jax.scene import Formation, Scene, body
@@ -148,6 +147,8 @@ class Statics:
             along = np.column_stack([np.zeros((2, 2 * count + 2)), np.eye(2), path[0] - path[1]])
             equal, right = np.vstack([equal, along]), np.append(right, path[0])
         free = [(None, None)] * (2 * count)
+        from scipy.optimize import linprog  # takes half a second to import, and most plans have no holds
+
         return linprog(
             np.append(np.zeros(2 * count + 4), -1.0),
             A_ub=np.vstack([upper, moving]),

@@ -22,6 +22,7 @@ import optax
 from wholearm_jax.descent import COLDEST, JOINED, Limits, advance, begin, interior_point, passed_on, projected
 from wholearm_jax.motion import Integration
 from wholearm_jax.plan import Result, Traced, balance_at_start, describe, outcomes, require_x64, run, stays, trace
+from wholearm_jax.programs import Program
 from wholearm_jax.reduction import blank
 from wholearm_jax.scene import Phase, Scene
 from wholearm_jax.schedule import Torque, padded, rounded
@@ -440,8 +441,8 @@ def _profile(knots: int, p: float, q: float):
     )
 
 
-_holds = jax.jit(jax.vmap(holds, (None, 0, 0, 0)))
-_bound = jax.jit(bound)
+_holds = Program(jax.vmap(holds, (None, 0, 0, 0)))
+_bound = Program(bound)
 
 
 @jax.jit

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 from wholearm_jax.forces import Score, arcs, force, on_arc, score
 from wholearm_jax.holding import Departure, Held, Statics, statics, watch
 from wholearm_jax.motion import Integration, Motion, move
+from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Change, Table, change, horner, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, body, contact_name
 from wholearm_jax.schedule import Torque, has_steps, padded, rounded, window
@@ -127,7 +128,7 @@ class Result:
         return next(failed, f"ok, margin {self.margin:.4g} N")
 
 
-@eqx.filter_jit
+@Program
 def prepare(scene_body, hand, gravity, formation, rough, heading, resolution: Resolution = Resolution()) -> Traced:
     """Trace a formation's wire from a rough start (SI) and tabulate its reduced dynamics."""
     mechanics = system(scene_body, hand, gravity, formation)
@@ -152,7 +153,7 @@ def run(
     return _run(table, schedule, start, duration, arriving, how, goal, arrival)
 
 
-@eqx.filter_jit
+@Program
 def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, goal, arrival) -> Outcome:
     seen = window(schedule, start, duration)
     entered = change(table, arriving)
@@ -460,7 +461,7 @@ def by_contact(table: Table, piece, forces: Float[Array, "slots"]):
     return tuple(jnp.where(slot >= 0, values[slot], jnp.nan) for values in (forces, tangential))
 
 
-@eqx.filter_jit
+@Program
 def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shares) -> Trajectory:
     """A phase's motion at given shares of its duration; beyond its end the object rests there."""
     seen = window(schedule, start, duration)

@@ -1,0 +1,104 @@
+"""Kept programs: read instead of traced, equal to traced ones, never mistaken for others, never in the way."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from wholearm_jax import programs
+
+
+class Ramp(eqx.Module):
+    """A pytree with a static field."""
+
+    slope: jax.Array
+    power: int = eqx.field(static=True)
+
+
+TRACED = []
+
+
+def climb(ramp: Ramp, at, shift=0.0):
+    """Says that it is traced."""
+    TRACED.append(ramp.power)
+    return Ramp(ramp.slope * at**ramp.power + shift, ramp.power), {"at": at}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    TRACED.clear()
+    programs.keep(tmp_path)
+    yield tmp_path
+    programs.keep(None)
+
+
+def call(power=2, at=3.0, **others):
+    """As a new process would: nothing is in memory."""
+    return programs.Program(climb)(Ramp(jnp.asarray(2.0), power), jnp.asarray(at), *others.values())
+
+
+def test_a_later_process_reads_what_an_earlier_one_traced(folder):
+    first, second = call(), call(at=4.0)
+    assert TRACED == [2]
+    assert len(list(folder.iterdir())) == 1
+    assert float(first[0].slope) == 18.0
+    assert float(second[0].slope) == 32.0
+    assert second[0].power == 2
+    assert float(second[1]["at"]) == 4.0
+
+
+def test_static_arguments_shapes_and_settings_name_programs_of_their_own(folder):
+    assert float(call(power=3)[0].slope) == 54.0
+    assert float(call(power=2)[0].slope) == 18.0
+    assert call(at=[1.0, 2.0])[0].slope.tolist() == [2.0, 8.0]
+    assert float(call(shift=1.0)[0].slope) == 19.0
+    assert float(call(shift=2.0)[0].slope) == 20.0
+    assert TRACED == [3, 2, 2, 2, 2]
+    assert len(list(folder.iterdir())) == 5
+
+
+@pytest.mark.parametrize("content", [b"", b"nonsense", b"\x80\x04N."])
+def test_a_file_that_cannot_be_read_is_written_anew(folder, content):
+    call()
+    (path,) = folder.iterdir()
+    whole = path.read_bytes()
+    path.write_bytes(content)
+    assert float(call()[0].slope) == 18.0
+    assert TRACED == [2, 2]
+    assert len(path.read_bytes()) == len(whole)
+
+
+def test_a_folder_that_cannot_be_written_to_does_no_harm(tmp_path):
+    file = tmp_path / "file"
+    file.touch()
+    programs.keep(file)
+    assert float(call()[0].slope) == 18.0
+    programs.keep(None)
+
+
+def test_transformations_pass_by(folder):
+    program = programs.Program(climb)
+    slopes = jax.vmap(lambda at: program(Ramp(jnp.asarray(2.0), 2), at)[0].slope)(jnp.arange(3.0))
+    assert slopes.tolist() == [0.0, 2.0, 8.0]
+    assert float(jax.grad(lambda at: program(Ramp(jnp.asarray(2.0), 2), at)[0].slope)(3.0)) == 12.0
+    assert not list(folder.iterdir())
+
+
+def apply(method, x):
+    return method.update(x, method.init(x))[0]
+
+
+def test_methods_are_named_by_what_they_hold(folder):
+    for factor, expected in ((2.0, 6.0), (5.0, 15.0), (2.0, 6.0)):
+        assert float(programs.Program(apply)(optax.scale(factor), jnp.asarray(3.0))) == expected
+    assert len(list(folder.iterdir())) == 2
+
+
+def test_what_cannot_be_named_is_not_kept(folder):
+    factor = np.asarray(7.0)
+    own = optax.GradientTransformation(lambda x: (), lambda x, state, params=None: (7 * x, state))
+    for method in (optax.scale(factor), own):
+        assert float(programs.Program(apply)(method, jnp.asarray(3.0))) == 21.0
+    assert not list(folder.iterdir())
