@@ -24,6 +24,8 @@ class Limits(NamedTuple):
     place: float
 
 
+# Terms smaller than this beside others are rounding: the drag of a joint that stands still has a speed of 1e-17.
+FLOOR = 1e-9
 DOUBLE = Limits(closure=1e-9, tables=1e-7, motion=1e-7, energy=1e-6, sign=1e-6, place=1e-7)
 SINGLE = Limits(closure=1e-4, tables=1e-2, motion=1e-2, energy=1e-2, sign=1e-2, place=1e-3)
 
@@ -127,7 +129,7 @@ def wire_residuals(model: Model, at) -> dict[str, np.ndarray]:
         inertial = inertia * x * at["acceleration"][..., k, None]
         contact = np.einsum("npic,npc->npi", wrench, at["force"][..., k])
         size = largest(inertial, contact, push).max(1, keepdims=True)
-        worst.append(np.abs(inertial - contact - push).max(-1) / np.maximum(size, 1e-12 * (1 + size.max(1))[:, None]))
+        worst.append(np.abs(inertial - contact - push).max(-1) / np.maximum(size, FLOOR * (1 + size.max(1))[:, None]))
     found["columns"] = np.max(worst, axis=0)
     return found
 
@@ -282,11 +284,17 @@ def departures(rest: Rest, torque, live, departing, tolerance) -> np.ndarray:
 # --- scenes that are refused -----------------------------------------------------------------------------------------
 
 
+def _orientation(model, z, x):
+    """`det [G_n; x]`."""
+    return np.linalg.det(np.concatenate([model.geometry(z[:, None]).normal_rows[:, 0], x[:, None]], axis=1))
+
+
 def loses_rank(model: Model, z, x, *, step=0.02, steps=400) -> np.ndarray:
     """Whether `G_n` loses rank on a wire followed from `z` along `x`: `det [G_n; x]` changes sign or vanishes."""
-    found, sign = np.zeros(len(z), bool), None
+    found = np.zeros(len(z), bool)
     active = np.arange(len(z))
     z, x = z.copy(), x.copy()
+    sign = np.sign(_orientation(model, z, x))
     for _ in range(steps):
         some = model.take(active)
         ahead = (z[active] + step * x[active])[:, None]
@@ -301,9 +309,7 @@ def loses_rank(model: Model, z, x, *, step=0.02, steps=400) -> np.ndarray:
         z[active] = ahead[:, 0]
         direction, least, most = some.tangent(ahead, u[:, None])
         x[active] = direction[:, 0]
-        at = some.geometry(ahead).normal_rows[:, 0]
-        det = np.linalg.det(np.concatenate([at, direction[:, :1, :].reshape(len(active), 1, 5)], axis=1))
-        sign = np.sign(det) if sign is None else sign
+        det = _orientation(some, ahead[:, 0], direction[:, 0])
         lost = (least[:, 0] < 1e-3 * most[:, 0]) | (np.sign(det) * sign[active] < 0) | ~safe
         lost |= dot(direction[:, 0], u) < 0.9
         found[active[lost]] = True

@@ -53,7 +53,7 @@ def named(values, names):
 def quantiles(values):
     """The quantiles of what is finite."""
     values = values[np.isfinite(values)]
-    return [float(f"{q:.3g}") for q in np.quantile(values, QUANTILES)] if len(values) else []
+    return [float(f"{q:.3g}") for q in np.quantile(values, QUANTILES)] if len(values) else [None] * len(QUANTILES)
 
 
 def examples(found):

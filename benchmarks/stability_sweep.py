@@ -181,14 +181,16 @@ def refuse(found, scenes, some, wires, tables, status, which, limits):
     heading = np.zeros_like(start)
     heading[np.arange(len(at)), some.coordinate] = some.sign
     x = model.tangent(start[:, None], heading[:, None])[0][:, 0]
+    rough = model.tangent((some.rough / checks.Units.of(model).z)[:, None], heading[:, None])
+    dependent = (rough[1] < 1e-5 * rough[2])[:, 0]
     touching = np.abs(model.geometry(start[:, None]).gap[:, 0]).max(1) < 100 * limits.closure
     still = np.abs(dot(x, heading)) < 1e-5
     reason = np.select(
         [
             status == checks.LEFT,
             status == checks.MAX_STEPS,
-            ~touching,
-            (status == checks.SINGULAR) & still,
+            ~touching & (status != checks.SINGULAR),
+            touching & (status == checks.SINGULAR) & still,
             (status == checks.SINGULAR) & (wires.status == 0),
             status == checks.SINGULAR,
             wires.status == 0,
@@ -206,6 +208,7 @@ def refuse(found, scenes, some, wires, tables, status, which, limits):
     lost = np.zeros(len(at), bool)
     if len(rank):
         lost[rank] = checks.loses_rank(model.take(rank), start[rank], x[rank])
+        lost[rank] |= dependent[rank]
     wedge = np.zeros(len(at), bool)
     some_wedged = np.flatnonzero(reason == WEDGED)
     if len(some_wedged):
@@ -268,7 +271,7 @@ def check_wire(found, rows, some, model, units, wires, tables, result, limits):
     unexplained = np.flatnonzero((depth.max(1) > limits.place) & ~(corner.max(1) > limits.place))
     if len(unexplained):
         z = along["z"][unexplained]
-        part = np.linspace(0, 1, 16, endpoint=False)[:, None]
+        part = np.linspace(0, 1, 96, endpoint=False)[:, None]
         between = (z[:, :-1, None] * (1 - part) + z[:, 1:, None] * part).reshape(len(z), -1, 5)
         corner[unexplained, 0] = depths(model.take(unexplained), between)[1].max(1)
     found["depth"][rows] = depth.max(1)
@@ -354,7 +357,7 @@ def check_rest(found, rows, some, model, units, result, limits):
     ):
         rest = checks.Rest(model, ends["z"][:, place], ends["x"][:, place])
         begin, stop = np.broadcast_to(begin, len(rows)), np.broadcast_to(stop, len(rows))
-        inside = (times > begin[:, None]) & (times < stop[:, None])
+        inside = (times > begin[:, None]) & (times < stop[:, None] - 1e-12)
         first, last = (torque_at(times, value, at, side) for at, side in ((begin, "right"), (stop, "left")))
         torque = np.concatenate([first[:, None], value, last[:, None]], axis=1)
         live = np.concatenate([np.ones((len(rows), 1), bool), inside, np.ones((len(rows), 1), bool)], axis=1)

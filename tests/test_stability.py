@@ -54,6 +54,7 @@ def turning():
         [-0.332, 0.997, 1.245, 2.339, 1.472],
         joint=(1.97, -1.32),
         length=6.7,
+        offset=(-0.02, 0.0),  # at a root on the palm a vertex would leave the finger and meet the palm at once
     )
 
 

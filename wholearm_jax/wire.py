@@ -98,9 +98,11 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     places = _places(system, heading, march, resolution)
     wire = _cut(system, fixed, march, places, start, resolution)
     touching = residual < 100 * jnp.finfo(rough.dtype).eps
+    dependent = ~touching & _dependent(fixed, stop_gradient(rough))
     direction = jnp.abs(first_tangent[_leading(heading, first_tangent)]) > 1e-6
     worst = jnp.select(
         [
+            dependent,
             ~touching,
             _misplaced(fixed, stop_gradient(start)),
             ~direction,
@@ -109,6 +111,7 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
             places.failed | wire.status.astype(bool),
         ],
         [
+            int(Status.SINGULAR),
             int(Status.NO_CONVERGENCE),
             int(Status.LEFT_FORMATION),
             int(Status.SINGULAR),
@@ -123,6 +126,11 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
         wire,
         (worst, residual, constraints(fixed.contacts, start) * fixed.length),
     )
+
+
+def _share(values, digits: float):
+    """What is zero to a share of the digits of a precision: 1e-10 for five eighths of float64, 5e-5 of float32."""
+    return jnp.finfo(values.dtype).eps ** digits
 
 
 # --- the wire's start and tangent -----------------------------------------------------------------------------------
@@ -171,19 +179,26 @@ def _project(system, rough):
         return jnp.concatenate([constraints(system.contacts, z), (tangent(system, z, hint) @ (z - rough))[None]])
 
     root = newton(nearest, z, system, rough)
-    near = jnp.where(root.residual < 1e-6, root.z, z)
+    near = jnp.where(root.residual < _share(z, 3 / 8), root.z, z)
     return near, jnp.abs(constraints(fixed.contacts, stop_gradient(near))).max()
 
 
 def _misplaced(system, z):
     """Whether a contact lies beyond its feature, or a vertex behind the palm or (of a convex object) a finger."""
-    tolerance = jnp.finfo(z.dtype).eps ** 0.625
+    tolerance = _share(z, 5 / 8)
     held, pairs = frames(system.contacts, z), frames(system.candidates, z)
     beyond = (held.along < system.contacts.lower - tolerance) | (held.along > system.contacts.upper + tolerance)
     inside = (pairs.along > system.candidates.lower) & (pairs.along < system.candidates.upper)
     palm = system.candidates.finger.sum(1) == 0
     behind = system.watched & system.candidates.on_link & inside & (pairs.gap < -tolerance)
     return jnp.any(beyond) | jnp.any(behind & (palm | system.convex))
+
+
+def _dependent(system, z):
+    """Whether the constraints depend on one another at `z`: their rows span no volume."""
+    rows = constraint_rows(system.contacts, z)
+    rows = rows / jnp.sqrt((rows**2).sum(1, keepdims=True))
+    return inverse(times(rows, rows.T))[1] < _share(z, 3 / 4)
 
 
 def _null(system, z):
@@ -208,12 +223,20 @@ def _leading(heading, x):
 # --- the march -------------------------------------------------------------------------------------------------------
 
 
+class _Watched(NamedTuple):
+    """Values that stay positive on a wire (`_watch`), their rates `d/ds`, and places along candidate features."""
+
+    values: Float[Array, "watch"]
+    rates: Float[Array, "watch"]
+    along: Float[Array, "candidates"]
+
+
 class _March(NamedTuple):
     """Nodes along the wire: `n` of them, in charts numbered by `chart`; the last is where the end was bracketed.
 
     `orientation` is `det [G; x]` at each; `flips` says what reverses or turns on the way to it from the node before
     (`_speeds`, then the chart), at what `share` of that way. `speeds` are those of the last node, `sense` the signs
-    that they had last.
+    that they had last. `before` is what is watched at the last node within the wire, `beyond` at the last one tried.
     """
 
     n: Int[Array, ""]
@@ -231,9 +254,8 @@ class _March(NamedTuple):
     anchors: Float[Array, "charts 5"]
     anchor_s: Float[Array, "charts"]
     number: Int[Array, ""]
-    values: Float[Array, "watch"]
-    rates: Float[Array, "watch"]
-    along: Float[Array, "candidates"]
+    before: _Watched
+    beyond: _Watched
     end: Int[Array, ""]
     end_z: Float[Array, "5"]
     status: Int[Array, ""]
@@ -246,8 +268,7 @@ _CHARTS = 8
 def _march(system, heading, z, x):
     """Follow the wire in short steps until something ends it; remember the nodes."""
     sense = jnp.where(heading.until_value < z[heading.until_coordinate], -1.0, 1.0)
-    eps = jnp.finfo(z.dtype).eps
-    tolerance = eps**0.625
+    tolerance = _share(z, 5 / 8)
 
     def watch(z, x, u):
         def signed(z):
@@ -255,12 +276,12 @@ def _march(system, heading, z, x):
             return values.at[-1].multiply(jnp.where(heading.until_coordinate < 0, 1.0, sense)), along
 
         (values, along), (rates, _) = jax.jvp(signed, (z,), (x / (u @ x),))
-        return values, rates, along
+        return _Watched(values, rates, along)
 
     def buffer(row):
         return jnp.zeros((MAX_MARCH, *row.shape), row.dtype).at[0].set(row)
 
-    values, rates, along = watch(z, x, x)
+    watched = watch(z, x, x)
     speeds = _speeds(system, z, x)
     begin = _March(
         n=jnp.asarray(1),
@@ -278,9 +299,8 @@ def _march(system, heading, z, x):
         anchors=jnp.zeros((_CHARTS, 5), z.dtype).at[0].set(z),
         anchor_s=jnp.zeros(_CHARTS, z.dtype),
         number=jnp.asarray(0),
-        values=values,
-        rates=rates,
-        along=along,
+        before=watched,
+        beyond=watched,
         end=jnp.asarray(-1),
         end_z=z,
         status=jnp.asarray(0),
@@ -291,13 +311,12 @@ def _march(system, heading, z, x):
         z, x, u = m.z[m.n - 1], m.x[m.n - 1], m.charts[m.number]
         z_new, moved, _ = _correct(system, u, z + m.step * x / (u @ x), u @ z + m.step)
         x_new, orientation = _oriented_tangent(system, z_new, u)
-        values, rates, along = watch(z_new, x_new, u)
-        good = (moved < 1e-8) & (x_new @ x > 0.98) & jnp.all(jnp.isfinite(x_new))
-        crossed, where = _crossings(system, m, values, rates, along, tolerance)
+        watched = watch(z_new, x_new, u)
+        good = (moved < _share(z, 1 / 2)) & (x_new @ x > 0.98) & jnp.all(jnp.isfinite(x_new))
+        crossed, _ = _crossings(system, m.before, watched, m.step, tolerance)
         ends = good & jnp.any(crossed)
         bracketed = ends & (m.step <= SHORTEST)
         accept = good & ~jnp.any(crossed)
-        first = jnp.argmin(jnp.where(crossed, where, jnp.inf))
         row = jnp.where(accept | bracketed, m.n, MAX_MARCH)
         turn = accept & (u @ x_new < 0.6)
         number = m.number + turn
@@ -326,16 +345,30 @@ def _march(system, heading, z, x):
             anchors=m.anchors.at[chart_row].set(z_new, mode="drop"),
             anchor_s=m.anchor_s.at[chart_row].set(s_new, mode="drop"),
             number=number,
-            values=jnp.where(accept, values, m.values),
-            rates=jnp.where(accept, rates * (u @ x_new) / jnp.where(turn, 1.0, u @ x_new), m.rates),
-            along=jnp.where(accept, along, m.along),
-            end=jnp.where(bracketed, first, m.end),
-            end_z=jnp.where(bracketed, z + (z_new - z) * where[first], m.end_z),
+            before=jax.tree.map(
+                lambda new, old: jnp.where(accept, new, old),
+                watched._replace(rates=watched.rates * jnp.where(turn, u @ x_new, 1.0)),
+                m.before,
+            ),
+            beyond=watched,
+            end=m.end,
+            end_z=m.end_z,
             status=jnp.select([lost, full & ~bracketed], [int(Status.SINGULAR), int(Status.MAX_STEPS)], 0),
             done=bracketed | lost | full,
         )
 
-    return jax.lax.while_loop(lambda m: ~m.done, step, begin)
+    return _ended(system, jax.lax.while_loop(lambda m: ~m.done, step, begin), tolerance)
+
+
+def _ended(system, m: _March, tolerance) -> _March:
+    """What ends the wire first between the last two nodes of a march, and about where."""
+    low, high = jnp.maximum(m.n - 2, 0), jnp.maximum(m.n - 1, 1)
+    step = jnp.where(m.status == 0, m.s[high] - m.s[low], 1.0)
+    crossed, where = _crossings(system, m.before, m.beyond, step, tolerance)
+    first = jnp.argmin(jnp.where(crossed, where, jnp.inf))
+    z = m.z[low] + (m.z[high] - m.z[low]) * where[first]
+    found = (m.status == 0) & jnp.any(crossed)
+    return m._replace(end=jnp.where(found, first, -1), end_z=jnp.where(found, z, m.end_z))
 
 
 def _correct(system, u, z, height, steps=3):
@@ -353,18 +386,30 @@ def _correct(system, u, z, height, steps=3):
     return z, jnp.where(jnp.isfinite(moved), moved, jnp.inf), inverted
 
 
-def _crossings(system, m, values, rates, along, tolerance):
-    """Which watched values turn negative within a step (or dip below zero and return), and at what share of it."""
-    through = (m.values >= -tolerance) & (values < -tolerance)
-    slope = jnp.where(rates > m.rates, rates - m.rates, 1.0)
-    turns = (m.rates < 0) & (rates > 0) & (m.values > tolerance) & (values > tolerance)
-    dips = turns & (m.values - m.step * m.rates**2 / (2 * slope) < 0)
-    fall = jnp.where(through, m.values - values, 1.0)
-    where = jnp.where(through, jnp.clip(m.values / fall, 0.0, 1.0), -m.rates / slope)
+def _crossings(system, before: _Watched, after: _Watched, step, tolerance):
+    """Which watched values turn negative within a step (or dip below zero and return), and at what share of it.
+
+    The share is a root of the cubic through values and rates: several things that end a wire within the shortest step
+    are told apart to 1e-13.
+    """
+    old, new = before.values, after.values
+    through = (old >= -tolerance) & (new < -tolerance)
+    slope = jnp.where(after.rates > before.rates, after.rates - before.rates, 1.0)
+    turns = (before.rates < 0) & (after.rates > 0) & (old > tolerance) & (new > tolerance)
+    dips = turns & (old - step * before.rates**2 / (2 * slope) < 0)
+    line = jnp.clip(old / jnp.where(through, old - new, 1.0), 0.0, 1.0)
+    bend = jnp.sqrt(jnp.where(dips, before.rates**2 - 2 * old * slope / step, 0.0))
+    where = jnp.where(through, line, (-before.rates - bend) / slope)
+    low, high = step * before.rates, step * after.rates
+    square, cube = 3 * (new - old) - 2 * low - high, low + high - 2 * (new - old)
+    for _ in range(2):
+        rate = low + where * (2 * square + 3 * where * cube)
+        better = where - (old + where * (low + where * (square + where * cube))) / jnp.where(rate < 0, rate, -1.0)
+        where = jnp.where((rate < 0) & (better >= 0) & (better <= 1), better, where)
     pairs = system.candidates.lower.shape[0]
-    at = m.along + (along - m.along) * where[:pairs]
+    at = before.along + (after.along - before.along) * where[:pairs]
     inside = (at >= system.candidates.lower - tolerance) & (at <= system.candidates.upper + tolerance)
-    counts = jnp.concatenate([inside & system.watched, jnp.ones(values.shape[0] - pairs, bool)])
+    counts = jnp.concatenate([inside & system.watched, jnp.ones(new.shape[0] - pairs, bool)])
     return (through | dips) & counts, where
 
 
@@ -430,9 +475,9 @@ def _places(system, heading, march, resolution):
         return root.z, root.residual, _coordinate(march, chart, root.z)
 
     z, residual, s = jax.vmap(locate)(segment, what, guess, chart)
-    slack = jnp.where(what == _END, 4 * SHORTEST, 1e-6)
+    slack = jnp.where(what == _END, 4 * SHORTEST, _share(z, 3 / 8))
     before = jnp.where(segment > 0, march.s[jnp.maximum(segment - 1, 0)], 0.0)
-    astray = (residual > 1e-8) | (s < before - slack) | (s > march.s[segment] + slack)
+    astray = (residual > _share(z, 1 / 2)) | (s < before - slack) | (s > march.s[segment] + slack)
     failed = jnp.any(used & astray)
     kinks = jnp.where(used[:-1], s[:-1], jnp.inf)
     rank = jnp.argsort(stop_gradient(kinks))
@@ -449,7 +494,7 @@ def _branches(system, march, end, astray):
     live = (rows < march.n) & (rows > 0) & (march.end >= 0)
     size = jnp.abs(jnp.where(live, along, along[0])).max()
     # Where two wires meet, Newton's method finds the end to half of the digits only.
-    return jnp.any(live & (along * jnp.sign(along[0]) < jnp.finfo(end.dtype).eps ** 0.375 * size))
+    return jnp.any(live & (along * jnp.sign(along[0]) < _share(end, 3 / 8) * size))
 
 
 def _signs_of(values, tolerance):
@@ -513,7 +558,7 @@ def _cut(system, fixed, march, places, start, resolution):
     contact = jnp.where(march.end < pairs, march.end, (march.end - pairs) % 4)
     why = jnp.select([march.end < 0, march.end < pairs, march.end < pairs + 8], [NO_END, MADE, LEFT], UNTIL)
     return Wire(
-        status=(missed | (moved.max() > 1e-6)).astype(int),
+        status=(missed | (moved.max() > _share(nodes, 3 / 8))).astype(int),
         start=start,
         end=places.end,
         end_why=why,
@@ -569,7 +614,7 @@ def _interpolate(march, places, s, u):
 def _signs(values, owner, resolution):
     """Signs of slips and joint speeds of each piece, and whether any node contradicts its piece's sign."""
     total = jax.ops.segment_sum(values.sum(1), owner, resolution.pieces)
-    tolerance = jnp.finfo(values.dtype).eps ** 0.625
+    tolerance = _share(values, 5 / 8)
     signs = _signs_of(total, tolerance)
     missed = jnp.any(values * signs[owner][:, None] < -tolerance) | ~jnp.all(jnp.isfinite(values))
     return signs[:, :4], signs[:, 4:], missed
