@@ -37,7 +37,7 @@ from random_plans import plans as stopping_plans
 import wholearm_jax as wa
 from wholearm_jax.execution import Ending, Tolerance, execute
 from wholearm_jax.palette import LINK_COLOURS as COLOURS
-from wholearm_jax.plan import Result, end_configuration, sample
+from wholearm_jax.plan import Result, end_configuration, sample, start_configuration
 from wholearm_jax.proportion import wilson
 from wholearm_jax.schedule import padded
 from wholearm_jax.squeeze import coefficients
@@ -59,6 +59,7 @@ NEAR = (0.5, 2.0)  # distances from the planned end, over the tolerance, that ar
 NUDGE = 1e-3  # change of all torques that moves the end of a sensitive plan by more than the tolerance
 LAST = 0.03  # share of a phase that is its wire's end
 AROUND, KICK = 0.01, 0.01  # [s] before and after an impact, and share of the speed by which it is off, that count
+RADIUS = 0.04  # of the objects, about [m]
 PLACES = 1001  # samples a phase
 UNDECIDED = {Status.AMBIGUOUS, Status.SINGULAR, Status.NO_CONVERGENCE, Status.MAX_STEPS}
 
@@ -251,7 +252,18 @@ def executed(predicted: Predicted, timestep: float = TIMESTEP) -> dict:
     errors = {"position_error": done.position_error, "angle_error": abs(done.angle_error)}
     found = {"holds": holds, "ending": done.ending.value, "free": free, "free_contact": which, **errors}
     changes = [phase.start for phase in predicted.result.phases if any(phase.impulses)]
-    return found | {"impact": max((_impact(done, when) for when in changes), default=0.0)}
+    stops = [phase for phase in predicted.result.phases[1:] if not any(phase.impulses)]
+    found |= {"impact": max((_impact(done, when) for when in changes), default=0.0)}
+    return found | {"restless": max((_restless(done, phase) for phase in stops), default=0.0)}
+
+
+def _restless(done, phase) -> float:
+    """How fast an executed object moves where it should set out from rest, beyond the prediction, in mean speeds."""
+    when = phase.start + AROUND
+    pair = [np.stack([np.interp(when, c.time, c.z_dot[:, k]) for k in range(5)]) for c in (done.course, done.expected)]
+    way = np.asarray(end_configuration(phase.traced)) - np.asarray(start_configuration(phase.traced.table))
+    unit = np.array([RADIUS, RADIUS, 1.0, 1.0, 1.0])
+    return float(np.linalg.norm((pair[0] - pair[1]) / unit) / np.linalg.norm(way / unit) * phase.duration)
 
 
 def _impact(done, when: float) -> float:
@@ -334,6 +346,8 @@ def explain(predicted: Predicted, found: dict, finer: dict) -> str:
         return "the end is near the tolerance's limit"
     if finer["impact"] > KICK:
         return "impact: the speed after a change of formation is off by more than 1 %"
+    if finer["restless"] > KICK:
+        return "it comes to a stop micrometres early or late, and sets out with more than 1 % of its mean speed"
     return "sensitive: 0.1 % of the torque moves the end as far" if _sensitive(predicted) else "unexplained"
 
 

@@ -77,9 +77,9 @@ def collected(blocks, options, *, single):
             if process.wait():
                 raise SystemExit("a process of the sweep failed")
         parts = [pickle.loads(target.read_bytes()) for target, _ in running]
-    together = {key: np.concatenate([part[key] for part in parts]) for key in parts[0] if key != "extra"}
+    together = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     order = np.lexsort((together["row"], together["block"]))
-    return {key: value[order] for key, value in together.items()} | {"extra": [part["extra"] for part in parts]}
+    return {key: value[order] for key, value in together.items()}
 
 
 if __name__ == "__main__":

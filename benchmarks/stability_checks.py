@@ -53,6 +53,8 @@ VIOLATIONS = (
     "refused although touching",
     "refused although in place",
     "singular without a reason",
+    "gradient not finite",
+    "modes of gradients differ",
 )
 
 

@@ -69,7 +69,7 @@ def examples(found):
 def compared(double, single) -> dict:
     """Single against double precision on the same scenes."""
     n = len(single["status"])
-    same = {key: value[:n] for key, value in double.items() if key != "extra"}
+    same = {key: value[:n] for key, value in double.items()}
     both = same["moved"] & single["moved"] & (same["steps"] > 0) & (single["steps"] > 0)
     both &= np.isfinite(same["margin"]) & np.isfinite(single["margin"])
     close = both & (np.abs(same["length"] - single["length"]) < 1e-2 * same["length"])
@@ -94,9 +94,6 @@ def report(double, single, seed, seconds):
         "limits": {"float64": DOUBLE._asdict(), "float32": SINGLE._asdict()},
         "quantiles": QUANTILES,
     }
-    for part in double["extra"]:
-        for name, value in part.items():
-            result.setdefault(name, []).append(value)
     path = save("stability", result)
     draw(double, single).savefig(RESULTS / "stability.svg")
     table(result)

@@ -11,7 +11,7 @@ import numpy as np
 import stability_checks as checks
 from stability import BLOCK, STATUSES
 from stability_model import Model, dot
-from stability_programs import GAUSS, follower, tracer
+from stability_programs import FLOATS, GAUSS, follower, forward, reverse, tracer
 from stability_scenes import Scenes, draw
 
 from wholearm_jax.motion import Integration
@@ -61,10 +61,13 @@ SINGLE = Precision(
 )
 
 
+DIFFERENTIATED = 32  # scenes whose gradients are computed at once
+
+
 def work(blocks, seed, *, single, target: Path):
     """Run blocks of scenes and write one record a scene."""
     jax.config.update("jax_enable_x64", not single)
-    records, samples = [], []
+    records = []
     for block in blocks:
         begun = time.perf_counter()
         scenes = draw(BLOCK, 1_000_003 * seed + block)
@@ -75,7 +78,7 @@ def work(blocks, seed, *, single, target: Path):
         wrong = int((found["violations"] != 0).sum())
         print(f"block {block}: {time.perf_counter() - begun:.0f} s; {named}; {wrong} violations", flush=True)
     together = {key: np.concatenate([r[key] for r in records]) for key in records[0]}
-    target.write_bytes(pickle.dumps(together | {"extra": samples}))
+    target.write_bytes(pickle.dumps(together))
 
 
 def swept(scenes: Scenes, precision: Precision) -> dict[str, np.ndarray]:
@@ -102,6 +105,8 @@ def swept(scenes: Scenes, precision: Precision) -> dict[str, np.ndarray]:
         rows = np.sort(np.concatenate(later))
         if not len(rows):
             break
+    for stepped in (False, True):
+        check_gradients(found, scenes, stepped, precision)
     return found
 
 
@@ -111,11 +116,12 @@ def blank(scenes: Scenes):
     whole = ("status", "table_status", "reason", "violations", "level", "steps", "wire_end", "pieces")
     real = ("margin", "scale", "condition", "table_error", "length", "travel", "end_share", *RESIDUALS, *EXCESSES)
     found = {name: np.zeros(n, int) for name in whole} | {name: np.full(n, np.nan) for name in real}
+    found |= {"torque": np.zeros((n, *scenes.noise.shape[1:])), "gradient": np.full(n, np.nan)}
     found |= {"moved": np.zeros(n, bool), "corner": np.zeros(n, bool), "slope": np.zeros(n)}
     return found | {"family": scenes.family, "exact": scenes.exact, "at_rest": scenes.at_rest}
 
 
-RESIDUALS = ("closure", "tangent", "columns", "seam", "motion", "constraint", "energy")
+RESIDUALS = ("closure", "tangent", "columns", "seam", "motion", "constraint", "energy", "gradient")
 EXCESSES = ("sign", "beyond", "depth", "margin_excess", "tension_missed")
 
 
@@ -253,6 +259,7 @@ def simulate(found, scenes, which, wires, tables, level, stepped, final, limits)
     found["length"][rows] = tables.breaks[:, -1] - tables.breaks[:, 0]
     found["travel"][rows] = result.s
     found["moved"][rows] = result.moved
+    found["torque"][rows] = result.torque.values
     found["steps"][rows], found["end_share"][rows] = result.count, result.share
     found["wire_end"][rows], found["pieces"][rows] = wires.end_why, tables.count
     again = (result.status == checks.MAX_STEPS) | (found["energy"][rows] > limits.energy)
@@ -343,6 +350,28 @@ def check_motion(found, rows, model, units, result, limits):
     good = (result.status == checks.OK) | (result.moving_status == checks.OK)
     flag(found, rows, "ok with a tensile force", good & moving & ~(result.margin >= 0))
     flag(found, rows, "tension not seen in time", found["tension_missed"][rows] > limits.motion)
+
+
+def check_gradients(found, scenes, stepped, precision):
+    """Gradients of the margin wherever a plan succeeds at the first level: finite, and the same in both modes."""
+    level, limits = precision.levels[0], precision.limits
+    good = (found["status"] == checks.OK) & found["moved"] & (found["level"] == 0) & (scenes.stepped == stepped)
+    rows = np.flatnonzero(good)
+    how = Integration(max_steps=level.steps, stages=8, tolerance=level.tolerance, steps=stepped, adjoint="both")
+    for batch, real in batches(len(rows), DIFFERENTIATED):
+        some = to_device(Scenes(*scenes[rows[batch]]))
+        floats = {name: getattr(some, name) for name in FLOATS} | {"torque": to_device(found["torque"][rows[batch]])}
+        rng = np.random.default_rng(rows[batch][0])
+        way = {name: a * rng.uniform(-1.0, 1.0, a.shape).astype(a.dtype) for name, a in floats.items()}
+        along = np.asarray(forward(how)(floats, way, some)[1])[:real]
+        slopes = {name: np.asarray(a) for name, a in reverse(how)(floats, some).items()}
+        terms = [(slopes[name] * way[name]).reshape(len(batch), -1)[:real] for name in floats]
+        size = sum(np.abs(t).sum(1) for t in terms) + found["scale"][rows[batch][:real]]
+        apart = np.abs(sum(t.sum(1) for t in terms) - along) / np.maximum(size, 1e-300)
+        finite = np.all([np.isfinite(t).all(1) for t in terms], axis=0) & np.isfinite(along)
+        found["gradient"][rows[batch][:real]] = apart
+        flag(found, rows[batch][:real], "gradient not finite", ~finite)
+        flag(found, rows[batch][:real], "modes of gradients differ", finite & (apart > limits.motion))
 
 
 def check_rest(found, rows, some, model, units, result, limits):

@@ -11,7 +11,7 @@ from wholearm_jax import plan
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
     *("status", "scene", "contacts", "system", "elimination", "newton", "programs", "wire", "reduction"),
-    *("schedule", "motion", "forces", "verdict", "holding", "plan", "gradient_check"),
+    *("schedule", "motion", "forces", "verdict", "holding", "plan", "gradient", "gradient_check"),
     *("squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),
     *("free_bodies", "execution", "perturbation"),

@@ -29,6 +29,7 @@ from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
 
 SLIPPING = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
 SAMPLED = 1024  # samples of a phase that one call computes: numbers of samples that differ share a program
+ROUNDING = 1e4  # of a precision's last digit, the interpolation error that more panels do not make smaller
 CONTINUITY = 1e-6  # metres and radians by which a phase may begin beside the end of the one before it
 
 
@@ -254,7 +255,8 @@ def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, toleranc
         table = traced.table
         if not _concrete(table.error):
             return traced  # under a transformation shapes are fixed: the caller has chosen the resolution
-        coarse = bool(table.error > tolerance) and int(table.status) == Status.OK
+        least_error = ROUNDING * jnp.finfo(table.breaks.dtype).eps
+        coarse = bool(table.error > max(tolerance, least_error)) and int(table.status) == Status.OK
         full = int(table.count) >= resolution.pieces
         if full and resolution.pieces < 48:
             resolution = resolution._replace(pieces=2 * resolution.pieces, panels=2 * resolution.panels)
@@ -297,14 +299,18 @@ def margin(
     where a contact would pull; `-inf` where a phase has no motion to score. Whether the plan succeeds is for
     `simulate` to say. Phases that hold the object do not count.
 
-    The forces are those of the paper's section 2.2, its `c_n > 0` (derivation, sections 4 and 7). Needs float64:
-    without, wires cannot be traced and the margin is `-inf`.
+    The forces are those of the paper's section 2.2, its `c_n > 0` (derivation, sections 4 and 7). In
+    float32 it has three digits (`docs/accuracy.md`).
 
     >>> scene = wa.load("heptagon")
     >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")
     0.70 N
     """
-    found = outcomes(scene, torque, trace(scene, resolution=resolution), how)
+    return least(scene, outcomes(scene, torque, trace(scene, resolution=resolution), how))
+
+
+def least(scene: Scene, found: tuple[Outcome, ...]) -> Float[Array, ""]:
+    """The least margin [N] of simulated phases, those that hold left out; `-inf` where one has no motion to score."""
     moving = [o.score.margin for o, p in zip(found, scene.phases, strict=True) if p.arrive != "hold"]
     return jnp.stack([jnp.where(jnp.isfinite(m), m, -jnp.inf) for m in moving]).min()
 

@@ -1,0 +1,37 @@
+"""The margin's gradient with respect to torques: in either mode that of differences, in the cheaper one by itself."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_gradients import nearest_difference
+
+import wholearm_jax as wa
+from wholearm_jax.gradient import FORWARD, mode, torque_gradient
+
+DATA = Path(__file__).parent / "data"
+
+
+def thinned(torque, rows):
+    """A schedule read off at evenly spaced times."""
+    times = np.linspace(0.0, 2.0, rows)
+    return wa.torque(times, np.stack([np.interp(times, torque.times, torque.values[:, k]) for k in range(2)], axis=1))
+
+
+@pytest.mark.parametrize(("rows", "expected"), [(FORWARD, "forward"), (FORWARD + 1, "reverse")])
+def test_both_modes_agree_with_differences(rows, expected):
+    scene = wa.load("heptagon")
+    schedule, traced = thinned(wa.read_torque(DATA / "heptagon_torque.csv"), rows), wa.trace(scene)
+    assert mode(schedule) == expected
+    margin, slope = torque_gradient(scene, schedule, traced=traced)
+    assert float(margin) == pytest.approx(wa.simulate(scene, schedule, traced=traced).margin, rel=1e-9)
+    way = np.random.default_rng(1).normal(size=(rows, 2)) * 0.05
+
+    def along(h):
+        bent = wa.torque(schedule.times, schedule.values + h * jnp.asarray(way))
+        return wa.simulate(scene, bent, traced=traced, tolerance=1e-12).margin
+
+    exact = float((slope * way).sum())
+    assert abs(exact) > 1e-3
+    assert exact == pytest.approx(nearest_difference(along, exact), rel=1e-5)
