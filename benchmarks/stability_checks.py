@@ -22,12 +22,13 @@ class Limits(NamedTuple):
     energy: float
     sign: float
     place: float
+    gradient: float
 
 
 # Terms smaller than this beside others are rounding: the drag of a joint that stands still has a speed of 1e-17.
 FLOOR = 1e-9
-DOUBLE = Limits(closure=1e-9, tables=1e-7, motion=1e-7, energy=1e-6, sign=1e-6, place=1e-7)
-SINGLE = Limits(closure=1e-4, tables=1e-2, motion=1e-2, energy=1e-2, sign=1e-2, place=1e-3)
+DOUBLE = Limits(closure=1e-9, tables=1e-7, motion=1e-7, energy=1e-6, sign=1e-6, place=1e-7, gradient=1e-5)
+SINGLE = Limits(closure=1e-4, tables=1e-2, motion=1e-2, energy=1e-2, sign=1e-2, place=1e-3, gradient=1.0)
 
 VIOLATIONS = (
     "number missing",

@@ -105,7 +105,7 @@ def swept(scenes: Scenes, precision: Precision) -> dict[str, np.ndarray]:
         rows = np.sort(np.concatenate(later))
         if not len(rows):
             break
-    for stepped in (False, True):
+    for stepped in (False, True) if precision is DOUBLE else ():
         check_gradients(found, scenes, stepped, precision)
     return found
 
@@ -371,7 +371,7 @@ def check_gradients(found, scenes, stepped, precision):
         finite = np.all([np.isfinite(t).all(1) for t in terms], axis=0) & np.isfinite(along)
         found["gradient"][rows[batch][:real]] = apart
         flag(found, rows[batch][:real], "gradient not finite", ~finite)
-        flag(found, rows[batch][:real], "modes of gradients differ", finite & (apart > limits.motion))
+        flag(found, rows[batch][:real], "modes of gradients differ", finite & (apart > limits.gradient))
 
 
 def check_rest(found, rows, some, model, units, result, limits):

@@ -385,7 +385,7 @@ class Descent(NamedTuple):
     """A descent on its way: variables, the optimiser's state, and the step that led here, to take again if it failed.
 
     `least` is each phase's smallest sampled force over its unit and `apart` the sum of the defects, both of the
-    variables before the step (NaN where they cannot be simulated).
+    variables before the step (NaN where they cannot be simulated). `reach` is the part of a step that is taken.
     """
 
     p: Variables
@@ -395,13 +395,14 @@ class Descent(NamedTuple):
     share: Float[Array, ""]
     least: Float[Array, "phases"]
     apart: Float[Array, ""]
+    reach: Float[Array, ""]
 
 
 @Program
 def begin(p: Variables, optimiser) -> Descent:
     """A descent before its first step."""
     zero, still = jnp.zeros(()), jax.tree.map(jnp.zeros_like, p)
-    return Descent(p, optimiser.init(ravel_pytree(p)[0]), p, still, zero + 1, 0 * p.log_duration, zero)
+    return Descent(p, optimiser.init(ravel_pytree(p)[0]), p, still, zero + 1, 0 * p.log_duration, zero, zero + 1)
 
 
 @Program
@@ -416,11 +417,11 @@ def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimis
     def onward():
         flat, unravel = ravel_pytree(d.p)
         way, state = optimiser.update(jnp.zeros_like(flat), d.state, flat, linear=linear)
-        return Descent(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart)
+        return Descent(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart, d.reach)
 
     def again():
         least, apart = (jnp.full_like(a, jnp.nan) for a in (d.least, d.apart))
         return d._replace(share=d.share * SHORTER, least=least, apart=apart)
 
     after = jax.lax.cond(sound, onward, again)
-    return after._replace(p=moved(after.before, after.way, after.share, tables, limits))
+    return after._replace(p=moved(after.before, after.way, after.share * after.reach, tables, limits))

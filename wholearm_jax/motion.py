@@ -318,13 +318,24 @@ def _integrate(table, seen, duration, how, state, final, goal, floor):
         return solve(inputs, adaptive(knots), how.adjoint)
     ends = solve(stop_gradient(inputs), adaptive(stop_gradient(knots)), "none").ts
     assert ends is not None
-    ends = jnp.where(jnp.isfinite(ends), ends, stop_gradient(final))
+    ends = _continued(ends, stop_gradient(state.share), stop_gradient(final))
     # A step that ends on a knot moves with it; the next begins behind the knot where the torque may step there.
     knot = knots[jnp.argmin(jnp.abs(ends[:, None] - stop_gradient(knots)), axis=1)]
     on_knot = jnp.abs(ends - stop_gradient(knot)) < 1e-13
     ends = jnp.where(on_knot, ends + (knot - stop_gradient(knot)), ends)
     begins = jnp.where(on_knot, jnp.nextafter(stop_gradient(knot), jnp.inf), ends) if how.steps else ends
     return solve(inputs, _Repeat(ends, begins), how.adjoint)
+
+
+def _continued(ends, begin, final):
+    """Times of steps, with steps as long as the last one after it instead of infinite ones.
+
+    A batch goes on until its last member has finished: the others take steps that do not count, but that must be
+    harmless. One straight to the end of time would overflow, and what overflows has no derivative, not even zero.
+    """
+    taken = jnp.isfinite(ends).sum()
+    last, before = ends[taken - 1], jnp.where(taken > 1, ends[taken - 2], begin)
+    return jnp.where(jnp.isfinite(ends), ends, jnp.where(taken > 0, jnp.minimum(2 * last - before, final), final))
 
 
 def _append(state, wanted, share, s, w, entry_w, *, held):

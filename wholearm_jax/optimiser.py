@@ -299,7 +299,9 @@ def _descend(task: _Task, start: Variables, number: int, limits: Limits, method,
             return d.p, "the margin no longer improves", history
         if share < LOST:
             return d.p, "no step leads on", history
-        d = after
+        # Full steps may go round in a circle for ever, where knots pass kinks of the wire to and fro.
+        circling = count >= task.steps // 3 and apart > CLOSE
+        d = after._replace(reach=_HALF if circling else _ONE)
     return d.p, why, history
 
 
@@ -332,6 +334,8 @@ def _method(optimiser, phases: int):
 
 _ONE = np.ones(())
 _HOW = Integration()
+_HALF = np.full((), 0.5)
+CLOSE = 1e-5  # sum of the defects from which full steps close them
 LOST = 1e-6  # share of a step at which a descent gives up
 
 

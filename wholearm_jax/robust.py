@@ -92,8 +92,7 @@ def optimise_robustly(
         nominally = nominally or now
         if (now.share, now.margin) > (best_held.share, best_held.margin):
             best, best_held = torque, now
-        slope = jnp.where(jnp.isfinite(found.slope), found.slope, 0.0) * limit
-        moves, state = adam.update(-slope, state)
+        moves, state = adam.update(-found.slope * limit, state)
         share = jnp.clip(jnp.asarray(optax.apply_updates(share, moves)), -1.0, 1.0)
     assert nominally is not None
     return Robust(
