@@ -328,14 +328,15 @@ def _integrate(table, seen, duration, how, state, final, goal, floor):
 
 
 def _continued(ends, begin, final):
-    """Times of steps, with steps as long as the last one after it instead of infinite ones.
+    """Times of steps, with one as long as the last one after it and then `final` instead of infinite ones.
 
     A batch goes on until its last member has finished: the others take steps that do not count, but that must be
     harmless. One straight to the end of time would overflow, and what overflows has no derivative, not even zero.
     """
     taken = jnp.isfinite(ends).sum()
     last, before = ends[taken - 1], jnp.where(taken > 1, ends[taken - 2], begin)
-    return jnp.where(jnp.isfinite(ends), ends, jnp.where(taken > 0, jnp.minimum(2 * last - before, final), final))
+    one_more = (jnp.arange(ends.shape[0]) == taken) & (taken > 0)
+    return jnp.where(jnp.isfinite(ends), ends, jnp.where(one_more, jnp.minimum(2 * last - before, final), final))
 
 
 def _append(state, wanted, share, s, w, entry_w, *, held):

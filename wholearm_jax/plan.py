@@ -236,7 +236,7 @@ def joined(traced: Traced, rough) -> Traced:
     """Refuse a phase whose formation does not hold where the phase before it ended."""
     apart = jnp.abs(start_configuration(traced.table) - rough).max()
     status = traced.table.status
-    open_there = (status == 0) & ~(apart < CONTINUITY)
+    open_there = (status == 0) & ~(apart < max(CONTINUITY, jnp.finfo(apart.dtype).eps ** (5 / 8)))
     return eqx.tree_at(lambda t: t.table.status, traced, jnp.where(open_there, int(Status.NO_CONVERGENCE), status))
 
 
@@ -299,8 +299,8 @@ def margin(
     where a contact would pull; `-inf` where a phase has no motion to score. Whether the plan succeeds is for
     `simulate` to say. Phases that hold the object do not count.
 
-    The forces are those of the paper's section 2.2, its `c_n > 0` (derivation, sections 4 and 7). In
-    float32 it has three digits (`docs/accuracy.md`).
+    The forces are those of the paper's section 2.2, its `c_n > 0` (derivation, sections 4 and 7).
+    In float32 it has four digits (`docs/accuracy.md`).
 
     >>> scene = wa.load("heptagon")
     >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")

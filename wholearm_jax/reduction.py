@@ -226,12 +226,14 @@ def _place(wire, panel, at):
 def _tail(values):
     """The last two Chebyshev coefficients of every panel against the largest value of each function.
 
-    Functions a hundred thousand times smaller than their largest companion are judged against that.
+    Functions a hundred thousand times smaller than their largest companion (in float32, two hundred times: what should
+    be zero is rounding) are judged against that.
     """
     coefficients = jnp.einsum("kn,pn...->pk...", _TO_CHEBYSHEV[values.shape[1]], stop_gradient(values))
     tail = jnp.abs(coefficients[:, -2:]).sum(1).max(0)
     size = jnp.abs(values).max((0, 1))
-    return (tail / jnp.maximum(size, 1e-5 * size.max() + 1e-300)).max()
+    least = jnp.finfo(values.dtype).eps ** (1 / 3) * size.max() + jnp.finfo(values.dtype).tiny
+    return (tail / jnp.maximum(size, least)).max()
 
 
 def _transforms(nodes):
