@@ -34,7 +34,7 @@ def summary(found) -> dict:
         "reason_of_refusal": named(found["reason"][~traced], REASONS),
         "violations": {name: int((wrong >> bit & 1).sum()) for bit, name in enumerate(VIOLATIONS)},
         "scenes_with_violations": int((wrong != 0).sum()),
-        "example_of_violation": examples(found),
+        "examples_of_violations": examples(found),
         "object_passes_a_root_or_the_palm_end": int(found["corner"].sum()),
         "residual_quantiles": {
             name: dict(zip(map(str, QUANTILES), quantiles(found[name]), strict=True)) for name in RESIDUALS + EXCESSES
@@ -56,14 +56,14 @@ def quantiles(values):
     return [float(f"{q:.3g}") for q in np.quantile(values, QUANTILES)] if len(values) else [None] * len(QUANTILES)
 
 
-def examples(found):
-    """One scene (block, row) for each kind of violation, to run it again."""
-    first = {}
+def examples(found, most=20):
+    """The first scenes (block, row) of each kind of violation, to run them again."""
+    some = {}
     for bit, name in enumerate(VIOLATIONS):
-        rows = np.flatnonzero(found["violations"] >> bit & 1)
+        rows = np.flatnonzero(found["violations"] >> bit & 1)[:most]
         if len(rows):
-            first[name] = [int(found["block"][rows[0]]), int(found["row"][rows[0]])]
-    return first
+            some[name] = np.stack([found["block"][rows], found["row"][rows]], axis=1).tolist()
+    return some
 
 
 def compared(double, single) -> dict:
