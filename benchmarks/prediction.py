@@ -259,23 +259,25 @@ def executed(predicted: Predicted, timestep: float = TIMESTEP) -> dict:
 
 def _restless(done, phase) -> float:
     """How fast an executed object moves where it should set out from rest, beyond the prediction, in mean speeds."""
-    when = phase.start + AROUND
-    pair = [np.stack([np.interp(when, c.time, c.z_dot[:, k]) for k in range(5)]) for c in (done.course, done.expected)]
+    moves, should = _speeds(done, phase.start + AROUND)
     way = np.asarray(end_configuration(phase.traced)) - np.asarray(start_configuration(phase.traced.table))
     unit = np.array([RADIUS, RADIUS, 1.0, 1.0, 1.0])
-    return float(np.linalg.norm((pair[0] - pair[1]) / unit) / np.linalg.norm(way / unit) * phase.duration)
+    return float(np.linalg.norm((moves - should) / unit) / np.linalg.norm(way / unit) * phase.duration)
 
 
 def _impact(done, when: float) -> float:
     """By how much more of its speed an executed object is off the prediction after a change than before it."""
 
     def off(time):
-        pair = [
-            np.stack([np.interp(time, c.time, c.z_dot[:, k]) for k in range(5)]) for c in (done.course, done.expected)
-        ]
-        return np.linalg.norm(pair[0] - pair[1]) / max(np.linalg.norm(pair[1]), 1e-9)
+        moves, should = _speeds(done, time)
+        return np.linalg.norm(moves - should) / max(np.linalg.norm(should), 1e-9)
 
     return float(off(when + AROUND) - off(when - AROUND))
+
+
+def _speeds(done, time: float) -> list[np.ndarray]:
+    """`z_dot` as executed and as predicted."""
+    return [np.stack([np.interp(time, c.time, c.z_dot[:, k]) for k in range(5)]) for c in (done.course, done.expected)]
 
 
 def _longest(flags) -> int:

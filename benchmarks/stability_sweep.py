@@ -116,7 +116,7 @@ def blank(scenes: Scenes):
     whole = ("status", "table_status", "reason", "violations", "level", "steps", "wire_end", "pieces")
     real = ("margin", "scale", "condition", "table_error", "length", "travel", "end_share", *RESIDUALS, *EXCESSES)
     found = {name: np.zeros(n, int) for name in whole} | {name: np.full(n, np.nan) for name in real}
-    found |= {"torque": np.zeros((n, *scenes.noise.shape[1:])), "gradient": np.full(n, np.nan)}
+    found |= {"torque": np.zeros((n, *scenes.noise.shape[1:]))}
     found |= {"moved": np.zeros(n, bool), "corner": np.zeros(n, bool), "slope": np.zeros(n)}
     return found | {"family": scenes.family, "exact": scenes.exact, "at_rest": scenes.at_rest}
 
@@ -187,8 +187,6 @@ def refuse(found, scenes, some, wires, tables, status, which, limits):
     heading = np.zeros_like(start)
     heading[np.arange(len(at)), some.coordinate] = some.sign
     x = model.tangent(start[:, None], heading[:, None])[0][:, 0]
-    rough = model.tangent((some.rough / checks.Units.of(model).z)[:, None], heading[:, None])
-    dependent = (rough[1] < 1e-5 * rough[2])[:, 0]
     touching = np.abs(model.geometry(start[:, None]).gap[:, 0]).max(1) < 100 * limits.closure
     still = np.abs(dot(x, heading)) < 1e-5
     reason = np.select(
@@ -213,8 +211,11 @@ def refuse(found, scenes, some, wires, tables, status, which, limits):
     rank = np.flatnonzero((reason == RANK) | (reason == ASTRAY))
     lost = np.zeros(len(at), bool)
     if len(rank):
-        lost[rank] = checks.loses_rank(model.take(rank), start[rank], x[rank])
-        lost[rank] |= dependent[rank]
+        some_ranked = model.take(rank)
+        lost[rank] = checks.loses_rank(some_ranked, start[rank], x[rank])
+        z = (some.rough[rank] / checks.Units.of(some_ranked).z)[:, None]
+        _, smallest, largest = some_ranked.tangent(z, heading[rank][:, None])
+        lost[rank] |= (smallest < 1e-5 * largest)[:, 0]
     wedge = np.zeros(len(at), bool)
     some_wedged = np.flatnonzero(reason == WEDGED)
     if len(some_wedged):

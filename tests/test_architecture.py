@@ -10,12 +10,12 @@ from wholearm_jax import plan
 
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
-    *("status", "scene", "contacts", "system", "elimination", "newton", "programs", "wire", "reduction"),
+    *("status", "scene", "contacts", "system", "elimination", "newton", "writing", "programs", "wire", "reduction"),
     *("schedule", "motion", "forces", "verdict", "holding", "plan", "gradient", "gradient_check"),
     *("squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),
     *("free_bodies", "execution", "perturbation"),
-    *("writing", "scene_file", "result_file", "store", "polygon_file", "palette", "report", "drawing", "__init__"),
+    *("scene_file", "result_file", "store", "polygon_file", "palette", "report", "drawing", "__init__"),
     *("arguments", "batch_command", "command"),
 )
 

@@ -12,7 +12,6 @@ import functools
 import hashlib
 import os
 import pickle
-import tempfile
 import types
 from collections.abc import Callable
 from importlib.metadata import version
@@ -24,6 +23,8 @@ import jax
 import jax.core
 import numpy as np
 from jax import export
+
+from wholearm_jax.writing import write_whole
 
 WRITTEN_WITH = ("jax", "jaxlib", "diffrax", "equinox", "optax")
 PLAIN = (bool, int, float, str, type(None))
@@ -74,7 +75,8 @@ class Program:
             return _callable(export.deserialize(program), shape)
         program, shape = self._trace(static, leaves, tree)
         with contextlib.suppress(OSError):  # a folder that cannot be written to: nothing is kept
-            _write(path, pickle.dumps((shape, bytes(program.serialize()))))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, pickle.dumps((shape, bytes(program.serialize()))))
         return _callable(program, shape)
 
     def _trace(self, static, leaves, tree):
@@ -125,11 +127,3 @@ def _surroundings() -> str:
     versions = [version(name) for name in WRITTEN_WITH]
     flags = jax.config.values["jax_enable_x64"], os.environ.get("XLA_FLAGS")
     return f"{source.hexdigest()} {versions} {jax.default_backend()} {flags}"
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Write whole or not at all: several processes may keep the same program at once."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        file.write(content)
-    os.replace(file.name, path)

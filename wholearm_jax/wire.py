@@ -329,7 +329,7 @@ def _march(system, heading, z, x):
         shorter = jnp.where(ends, jnp.maximum(m.step / 4, SHORTEST), m.step / 2)
         lost = ~good & (m.step < 1e-6)
         full = (m.n + 1 >= MAX_MARCH) | (number >= _CHARTS)
-        return _March(
+        return m._replace(
             n=m.n + (accept | bracketed),
             step=jnp.where(accept, jnp.minimum(m.step * 1.5, LONGEST), shorter),
             z=m.z.at[row].set(z_new, mode="drop"),
@@ -351,8 +351,6 @@ def _march(system, heading, z, x):
                 m.before,
             ),
             beyond=watched,
-            end=m.end,
-            end_z=m.end_z,
             status=jnp.select([lost, full & ~bracketed], [int(Status.SINGULAR), int(Status.MAX_STEPS)], 0),
             done=bracketed | lost | full,
         )
