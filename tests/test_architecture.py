@@ -10,7 +10,8 @@ from wholearm_jax import plan
 
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
-    *("status", "scene", "contacts", "system", "elimination", "newton", "writing", "programs", "wire", "reduction"),
+    *("status", "scene", "contacts", "system", "elimination", "newton", "writing", "programs"),
+    *("march", "wire", "reduction"),
     *("schedule", "motion", "forces", "verdict", "holding", "plan", "gradient", "gradient_check"),
     *("squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),

@@ -30,7 +30,7 @@ from wholearm_jax.reduction import Table, horner, powers
 from wholearm_jax.schedule import Window, interval, torque_in
 from wholearm_jax.status import Status
 
-LANDINGS = 16  # Newton steps, or halvings, to the place where a stage ends
+LANDINGS = 40  # at most so many Newton steps, or halvings, to the place where a stage ends
 ADJOINTS = {
     "none": dfx.DirectAdjoint(),
     "both": dfx.DirectAdjoint(),  # forward and reverse mode
@@ -169,10 +169,17 @@ def move(
     )
     free = jnp.asarray(free)
 
-    def stage(state, _):
-        return jax.lax.cond(state.done, lambda s: s, lambda s: _stage(table, seen, duration, how, free, s), state), None
+    def stage(state):
+        return _stage(table, seen, duration, how, free, state)
 
-    state, _ = jax.lax.scan(stage, state, None, length=how.stages)
+    if how.adjoint in ("none", "forward"):
+        state = _repeated(stage, state, how.stages)
+    else:  # reverse mode must know how often
+
+        def once(state, _):
+            return jax.lax.cond(state.done, lambda s: s, stage, state), None
+
+        state, _ = jax.lax.scan(once, state, None, length=how.stages)
     beyond = jnp.arange(capacity + 1) > state.count
     nodes = jnp.where(beyond[:, None], state.nodes[state.count], state.nodes)
     middle = (nodes[:-1, 0] + nodes[1:, 0]) / 2
@@ -187,6 +194,16 @@ def move(
         count=state.count,
         status=state.status,
     )
+
+
+def _repeated(stage, state: _State, most: int) -> _State:
+    """Stage after stage until all is done, at most so many."""
+
+    def going(loop):
+        count, state = loop
+        return ~state.done & (count < most)
+
+    return jax.lax.while_loop(going, lambda loop: (loop[0] + 1, stage(loop[1])), (jnp.asarray(0), state))[1]
 
 
 @jax.jit
@@ -412,18 +429,26 @@ def _land(table, seen, duration, how, piece, node, end, goal, floor, wanted):
         passing, resting = y[0] - goal_now, floor - y[1]
         return passing >= resting, jnp.maximum(passing, resting)
 
-    def narrow(_, bracket):
+    def narrow(bracket):
         """Newton on the step's length, bisecting where it would leave the bracket."""
-        low, high, length = bracket
+        low, high, length, _, count = bracket
         y = step(fixed[0], length, fixed[1], fixed[2])
         passed, miss = beyond(y)
         rate = field(fixed[0] + length, y, fixed[2])
         rate = jnp.where(passed, rate[0], -rate[1])
         low, high = jnp.where(miss < 0, length, low), jnp.where(miss < 0, high, length)
         guess = length - miss / jnp.where(rate == 0, 1.0, rate)
-        return low, high, jnp.where((guess >= low) & (guess <= high), guess, (low + high) / 2)
+        better = jnp.where((guess >= low) & (guess <= high), guess, (low + high) / 2)
+        return low, high, better, jnp.abs(better - length), count + 1
 
-    _, _, length = jax.lax.fori_loop(0, LANDINGS, narrow, (0 * fixed[3], fixed[3], fixed[3] / 2))
+    def going(bracket):
+        *_, moved, count = bracket
+        return (moved > enough) & (count < LANDINGS)
+
+    # Half of the digits and some: the last step below, which carries derivatives, brings the others.
+    enough = jnp.finfo(s.dtype).eps ** (5 / 8) * fixed[3]
+    begin = (jnp.zeros_like(fixed[3]), fixed[3], fixed[3] / 2, fixed[3], jnp.asarray(0))
+    length = jax.lax.while_loop(going, narrow, begin)[2]
     y = step(share, length, jnp.stack([s, w]), args)
     rate = stop_gradient(field(share + length, y, args))
     # An object that comes to rest just at the goal does both: it lands on the one that is nearer in time.

@@ -159,7 +159,7 @@ def reduce_wire(system: System, wire: Wire) -> Table:
 
 def blank(resolution: Resolution, contacts: int = 4) -> Table:
     """A table of the right shapes that holds no wire: something to compile with."""
-    pieces, panels, nodes = resolution
+    pieces, panels, nodes, _ = resolution
     zero, whole = jnp.asarray(np.zeros(())), jnp.asarray(np.zeros((), int))
     each = {name: np.zeros((panels, nodes, n)) for name, n in (("acceleration", 5), ("backward", 3))}
     each |= {name: np.zeros((panels, nodes, 5)) for name in ("configuration", "velocity")}
