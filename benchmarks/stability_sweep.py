@@ -281,7 +281,8 @@ def check_wire(found, rows, some, model, units, wires, tables, result, limits):
         z = along["z"][unexplained]
         part = np.linspace(0, 1, 96, endpoint=False)[:, None]
         between = (z[:, :-1, None] * (1 - part) + z[:, 1:, None] * part).reshape(len(z), -1, 5)
-        corner[unexplained, 0] = depths(model.take(unexplained), between)[1].max(1)
+        # A root may be in the object where no vertex is behind its link: look at every place.
+        corner[unexplained, 0] = model.take(unexplained).depth(between)[1].max(1)
     found["depth"][rows] = depth.max(1)
     found["corner"][rows] = corner.max(1) > limits.place
     flag(found, rows, "closure", found["closure"][rows] > limits.closure)

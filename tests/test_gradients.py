@@ -1,5 +1,6 @@
 """Derivatives of the margin: forward mode, reverse mode and Richardson-extrapolated differences agree."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import equinox as eqx
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
+from wholearm_jax.gradient import torque_gradient
 from wholearm_jax.motion import Integration
-from wholearm_jax.plan import end_configuration, margin
+from wholearm_jax.plan import end_configuration, margin, steps_within
 from wholearm_jax.scene_file import to_dict
 from wholearm_jax.schedule import Torque
 
@@ -45,6 +47,16 @@ def one_phase(name, row, push, change=lambda data: None, duration=0.6):
     return scene, Torque(1.01 * even.times, push * even.values)
 
 
+def stepping(scene, torque):
+    """The same torques, held through each third interval: they step at its end."""
+    rows = np.arange(len(torque.times))
+    held = np.where(rows % 3 == 2, rows - 1, rows)
+    times, values = np.asarray(torque.times), np.asarray(torque.values)
+    doubled = np.sort(np.append(rows, rows[2:-1:3]))
+    late = np.append(doubled[1:] == doubled[:-1], False)  # the first of two rows at one time
+    return scene, Torque(jnp.asarray(times[doubled]), jnp.asarray(values[np.where(late, held[doubled], doubled)]))
+
+
 HOW = Integration(adjoint="both", tolerance=1e-12)
 CASES = {
     "time runs out": ("heptagon", 0, 0.99),
@@ -54,18 +66,28 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=CASES)
+@pytest.fixture(scope="module", params=[*CASES, "torques that step"])
 def case(request):
+    if request.param == "torques that step":
+        return stepping(*one_phase(*CASES["time runs out"]))
     return one_phase(*CASES[request.param])
+
+
+def test_the_margin_is_that_of_the_simulation_whatever_it_will_be_differentiated_by(case):
+    scene, torque = case
+    simulated = wa.simulate(scene, torque).margin
+    assert float(margin(scene, torque)) == pytest.approx(simulated, rel=1e-9)
+    assert float(torque_gradient(scene, torque)[0]) == pytest.approx(simulated, rel=1e-9)
 
 
 def test_modes_and_differences_agree_along_random_directions(case):
     scene, torque = case
     floats, rest = eqx.partition((scene, torque.values), eqx.is_inexact_array)
+    steps = steps_within(scene, torque)
 
     def value(floats):
         scene, values = eqx.combine(floats, rest)
-        return margin(scene, Torque(torque.times, values), how=HOW)
+        return margin(scene, Torque(torque.times, values), how=replace(HOW, steps=steps))
 
     reverse = jax.grad(value)(floats)
     assert all(bool(jnp.all(jnp.isfinite(g))) for g in jax.tree.leaves(reverse))

@@ -9,7 +9,7 @@ import jax
 from jaxtyping import Array, Float
 
 from wholearm_jax.motion import Integration
-from wholearm_jax.plan import Traced, least, outcomes, require_x64, trace
+from wholearm_jax.plan import Traced, least, outcomes, require_x64, steps_within, trace
 from wholearm_jax.scene import Scene
 from wholearm_jax.schedule import Torque
 
@@ -30,7 +30,7 @@ def torque_gradient(
     (12, 2)
     """
     require_x64()
-    how = Integration(tolerance=tolerance, adjoint=mode(torque))
+    how = Integration(tolerance=tolerance, adjoint=mode(torque), steps=steps_within(scene, torque))
     return _gradient(scene, torque, traced or trace(scene), how)
 
 

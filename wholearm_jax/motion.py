@@ -104,10 +104,14 @@ class _FirstStep(dfx.AbstractAdaptiveStepSizeController):
 
 
 class _Repeat(dfx.AbstractStepSizeController):
-    """Takes given steps and rejects none: step `i` ends at `ends[i]`, the next begins at `begins[i]`."""
+    """Takes given steps and rejects none: step `i` ends at `ends[i]`, the next begins at `begins[i]`.
+
+    With `jumps` the field may jump between steps: what the last stage of one found serves no longer for the next.
+    """
 
     ends: Float[Array, "steps"]
     begins: Float[Array, "steps"]
+    jumps: bool = eqx.field(static=True)
 
     def wrap(self, direction):
         return self
@@ -117,7 +121,8 @@ class _Repeat(dfx.AbstractStepSizeController):
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, state):
         following = self.ends[jnp.minimum(state, self.ends.shape[0] - 1)]
-        return True, self.begins[state - 1], following, True, state + 1, dfx.RESULTS.successful
+        jumped = jnp.asarray(True) if self.jumps else False  # diffrax takes a constant `True` for its initial `False`
+        return True, self.begins[state - 1], following, jumped, state + 1, dfx.RESULTS.successful
 
 
 class _State(NamedTuple):
@@ -336,12 +341,15 @@ def _integrate(table, seen, duration, how, state, final, goal, floor):
     ends = solve(stop_gradient(inputs), adaptive(stop_gradient(knots)), "none").ts
     assert ends is not None
     ends = _continued(ends, stop_gradient(state.share), stop_gradient(final))
-    # A step that ends on a knot moves with it; the next begins behind the knot where the torque may step there.
+    # A step that ends on a knot moves with it. Where the torque may step it ends before the knot (diffrax has told the
+    # time behind it), and the next begins behind it.
     knot = knots[jnp.argmin(jnp.abs(ends[:, None] - stop_gradient(knots)), axis=1)]
-    on_knot = jnp.abs(ends - stop_gradient(knot)) < 1e-13
-    ends = jnp.where(on_knot, ends + (knot - stop_gradient(knot)), ends)
-    begins = jnp.where(on_knot, jnp.nextafter(stop_gradient(knot), jnp.inf), ends) if how.steps else ends
-    return solve(inputs, _Repeat(ends, begins), how.adjoint)
+    fixed = stop_gradient(knot)
+    on_knot = jnp.abs(ends - fixed) < 1e-13
+    before, behind = (jnp.nextafter(fixed, way) if how.steps else ends for way in (-jnp.inf, jnp.inf))
+    begins = jnp.where(on_knot, behind + (knot - fixed), ends)
+    ends = jnp.where(on_knot, before + (knot - fixed), ends)
+    return solve(inputs, _Repeat(ends, begins, how.steps), how.adjoint)
 
 
 def _continued(ends, begin, final):

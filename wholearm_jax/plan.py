@@ -297,7 +297,8 @@ def margin(
 
     Differentiable, in forward and reverse mode, with respect to the torques and every float of the scene; negative
     where a contact would pull; `-inf` where a phase has no motion to score. Whether the plan succeeds is for
-    `simulate` to say. Phases that hold the object do not count.
+    `simulate` to say. Phases that hold the object do not count. That the schedule steps is seen where its times and the
+    durations are numbers; where they are transformed too, say so: `how=Integration(adjoint="both", steps=True)`.
 
     The forces are those of the paper's section 2.2, its `c_n > 0` (derivation, sections 4 and 7).
     In float32 it has four digits (`docs/accuracy.md`).
@@ -306,6 +307,7 @@ def margin(
     >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")
     0.70 N
     """
+    how = replace(how, steps=how.steps or steps_within(scene, torque))
     return least(scene, outcomes(scene, torque, trace(scene, resolution=resolution), how))
 
 
@@ -357,7 +359,7 @@ def simulate(
     require_x64()
     require_covered(scene, torque)
     traced = traced or trace(scene)
-    stepped = any(has_steps(torque, start, end) for start, end in _spans(scene))
+    stepped = steps_within(scene, torque)
     while True:
         how = Integration(tolerance=tolerance, max_steps=max_steps, stages=max(8, max_steps // 32), steps=stepped)
         found = outcomes(scene, torque, traced, how, arrival)
@@ -365,6 +367,14 @@ def simulate(
         if not short or max_steps >= 16384:
             return describe(scene, torque, traced, found)
         max_steps *= 4
+
+
+def steps_within(scene: Scene, torque: Torque) -> bool:
+    """Whether a schedule steps within a phase; times and durations that are being transformed count as they do not."""
+    times = [torque.times, *(phase.duration for phase in scene.phases)]
+    if any(isinstance(one, jax.core.Tracer) for one in times):
+        return False
+    return any(has_steps(torque, start, end) for start, end in _spans(scene))
 
 
 def describe(scene: Scene, torque: Torque, traced, found) -> Result:
