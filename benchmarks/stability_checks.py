@@ -27,6 +27,7 @@ class Limits(NamedTuple):
 
 # Terms smaller than this beside others are rounding: the drag of a joint that stands still has a speed of 1e-17.
 FLOOR = 1e-9
+IDLE = 1e-6  # the same for a whole column, beside what it would be if all moved, or turned, at the rate of `s`
 DOUBLE = Limits(closure=1e-9, tables=1e-7, motion=1e-7, energy=1e-6, sign=1e-6, place=1e-7, gradient=1e-5)
 SINGLE = Limits(closure=1e-4, tables=1e-2, motion=1e-2, energy=1e-2, sign=1e-2, place=1e-3, gradient=1.0)
 
@@ -56,6 +57,7 @@ VIOLATIONS = (
     "singular without a reason",
     "gradient not finite",
     "modes of gradients differ",
+    "margin that comes with a gradient",
 )
 
 
@@ -127,11 +129,13 @@ def wire_residuals(model: Model, at) -> dict[str, np.ndarray]:
     weight[..., :2] = model.gravity[:, None]
     weight[..., 3:] -= model.dry[:, None] * at["joint"]
     drag[..., 3:] = -model.viscous[:, None] * x[..., 3:]
-    inertia, worst = model.inertia[:, None], []
+    inertia, worst, one = model.inertia[:, None], [], np.ones(len(span))
+    busy = [0 * one, model.inertia.max(1), model.viscous.max(1), one, one]
     for k, push in enumerate([weight, -inertia * bend, drag, torque[..., 0, :], torque[..., 1, :]]):
         inertial = inertia * x * at["acceleration"][..., k, None]
         contact = np.einsum("npic,npc->npi", wrench, at["force"][..., k])
         size = largest(inertial, contact, push).max(1, keepdims=True)
+        size = np.maximum(size, IDLE * busy[k][:, None])
         worst.append(np.abs(inertial - contact - push).max(-1) / np.maximum(size, FLOOR * (1 + size.max(1))[:, None]))
     found["columns"] = np.max(worst, axis=0)
     return found

@@ -53,6 +53,7 @@ class Followed(NamedTuple):
     ends: dict
     seam: Float[Array, ""]
     within: dict
+    grain: Float[Array, ""]
     finite: Float[Array, ""]
 
 
@@ -155,6 +156,10 @@ def follow(wire: Wire, table: Table, scene: Scenes, how: Integration) -> Followe
         jumps = jnp.stack([there["z"] - here["z"], there["x"] * table.factor[k + 1] - here["x"]]) / unit
         return jnp.where(k + 1 < table.count, jnp.abs(jumps).max(), 0.0)
 
+    # Rounding of what is differentiated in the panels of a piece, as short as pieces may be.
+    extent = table.breaks[motion.piece + 1] - table.breaks[motion.piece]
+    fine = jnp.finfo(end.dtype).eps * table.panels[motion.piece] / jnp.where(extent > 0, extent, jnp.inf)
+    grain = jnp.where(steps.live & ~motion.held, fine, 0.0).max()
     tension = jnp.where(jnp.isfinite(found.lost), found.lost, 0.0)
     shares = jnp.concatenate([end * TIMES, tension * (1 + 1e-7 * jnp.array([-1.0, 1.0]))]).astype(end.dtype)
     nodes = jnp.arange(how.max_steps)
@@ -183,6 +188,7 @@ def follow(wire: Wire, table: Table, scene: Scenes, how: Integration) -> Followe
         seam=jax.vmap(seam)(jnp.arange(table.factor.shape[0] - 1)).max(),
         within=jax.vmap(jax.vmap(state, (None, 0)), (0, None))(nodes, xi)
         | {"width": jnp.where(nodes < motion.count, motion.share[1:] - motion.share[:-1], 0.0) * scene.duration},
+        grain=grain,
         finite=jnp.all(jnp.stack([jnp.all(jnp.isfinite(part)) for part in parts])),
     )
 

@@ -26,7 +26,8 @@ from wholearm_jax.schedule import Window, torque_in
 
 SAMPLES = 7  # places in a step at which forces are sampled before the minimum is refined
 MOST_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
-REFINED = 4  # lowest samples refined; a minimum is missed only if four others sample lower
+REFINED = 4  # dips refined: those that parabolas through samples put lowest
+GOLDEN = 14  # sections to a dip: Newton's step on the true motion follows
 
 
 class Score(eqx.Module):
@@ -157,26 +158,22 @@ def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion
     """
     steps = arcs(table, seen, duration, motion)
     values = stop_gradient(sampled_slacks(table, seen, duration, steps))
-    per_step = values.min(1)
-    _, lowest = jax.lax.top_k(-per_step.ravel(), REFINED)
+    _, lowest = jax.lax.top_k(-_dips(values).ravel(), REFINED)
 
     def refine(flat):
         step, contact = flat // values.shape[2], flat % values.shape[2]
         arc = jax.tree.map(lambda a: a[step], steps)
-        seat = jnp.argmin(values[step, :, contact]) / (SAMPLES - 1)
-        fixed = stop_gradient((table, seen, duration, arc))
-
-        def one(xi):
-            return slacks_on(*fixed, xi)[contact]
-
-        xi = _minimise(one, seat, 1.0 / (SAMPLES - 1))
-        length = xi * (arc.share[1] - arc.share[0])
-        begin = jnp.stack([arc.quintic[0], motion.entry_w[step]])
-        s, w = single_step(table, seen, duration, how, arc.piece, arc.row, arc.share[0], begin, length)
-        share = arc.share[0] + length
-        here, slope = _slack_and_slope(table, seen, duration, arc, contact, share, s, w)
-        inner = (xi > 0) & (xi < 1)
-        here = here + slope * stop_gradient(jnp.where(inner, _to_minimum(fixed, contact, xi, slope), 0.0))
+        seat, reach = jnp.argmin(values[step, :, contact]) / (SAMPLES - 1), 1.0 / (SAMPLES - 1)
+        inputs = table, seen, duration, arc, motion.entry_w[step]
+        fixed = stop_gradient(inputs)
+        xi = _minimise(lambda xi: slacks_on(*fixed[:4], xi)[contact], seat, reach)
+        _, curve, shift, *_ = _dip(*fixed, how, contact, xi)
+        low, high = jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0)
+        xi = stop_gradient(jnp.clip(xi + shift, low, high))
+        here, curve, shift, slope, share, s = _dip(*inputs, how, contact, xi)
+        # To second order the least value, whose derivative is that at the true minimum.
+        shift = stop_gradient((jnp.clip(xi + shift, low, high) - xi) * (arc.share[1] - arc.share[0]))
+        here = here + slope * shift + stop_gradient(curve) * shift**2 / 2
         return jnp.where(arc.live & ~arc.held, here, jnp.inf), share, s, contact
 
     margin, share, s, contact = jax.vmap(refine)(lowest)
@@ -208,31 +205,41 @@ def smooth_margin(values, weights, temperature: Float[Array, ""]) -> tuple[Float
     return m + temperature * (weights * jnp.log(jnp.where(live, values - m, 1.0) / temperature)).sum(), m
 
 
-def _slack_and_slope(table, seen, duration, arc, contact, share, s, w):
-    """A constraint's slack at a state, and its rate per share of the phase along the motion."""
+def _dips(values: Float[Array, "steps samples rows"]) -> Float[Array, "steps rows"]:
+    """About how low each slack goes in each step: the least of its samples and of the parabola about it."""
+    least, seat = values.min(1), jnp.clip(jnp.argmin(values, axis=1), 1, values.shape[1] - 2)
+    before, here, after = (jnp.take_along_axis(values, (seat + k)[:, None], axis=1)[:, 0] for k in (-1, 0, 1))
+    slope, bend = (after - before) / 2, before - 2 * here + after
+    vertex = jnp.clip(-slope / jnp.where(bend > 0, bend, jnp.inf), -1.0, 1.0)
+    lowest = here + vertex * (slope + vertex * bend / 2)
+    return jnp.where(jnp.isfinite(least), jnp.minimum(least, lowest), jnp.inf)
+
+
+def _dip(table, seen, duration, arc, entry_w, how, contact, xi):
+    """A constraint's slack at `xi` of a step of the true motion, about its minimum.
+
+    The value, its second derivative (the quintic's) and how far in `xi` its minimum lies by Newton's step (0 at the
+    step's ends and where it does not curve up), its slope, and share and `s` there; derivatives are per share.
+    """
+    width = arc.share[1] - arc.share[0]
+    share, begin = arc.share[0] + xi * width, jnp.stack([arc.quintic[0], entry_w])
+    s, w = single_step(table, seen, duration, how, arc.piece, arc.row, arc.share[0], begin, xi * width)
 
     def at(share, s, w):
         return slack(table, force(table, seen, duration, arc.piece, arc.row, share, s, w))[contact]
 
     bend = acceleration(table, seen, duration, arc.piece, arc.row, share, s, w)
-    return jax.jvp(at, (share, s, w), (jnp.ones_like(share), w, bend))
-
-
-def _to_minimum(fixed, contact, xi, slope):
-    """How far, in shares, the true minimum lies from the quintic's: Newton's step with the force's own slope.
-
-    Added to the force to first order it leaves the value as it is, and makes the derivative that at the true minimum.
-    """
-    table, seen, duration, arc = fixed
-    width = jnp.where(arc.share[1] > arc.share[0], arc.share[1] - arc.share[0], 1.0)
-    curve = jax.grad(jax.grad(lambda xi: slacks_on(table, seen, duration, arc, xi)[contact]))(xi) / width**2
-    return -slope / jnp.where(curve > 0, curve, jnp.inf)
+    value, slope = jax.jvp(at, (share, s, w), (jnp.ones_like(share), w, bend))
+    wide = jnp.where(width > 0, width, 1.0)
+    curve = jax.grad(jax.grad(lambda xi: slacks_on(table, seen, duration, arc, xi)[contact]))(xi) / wide**2
+    inner = (xi > 0) & (xi < 1) & (curve > 0)
+    return value, curve, jnp.where(inner, -slope / jnp.where(inner, curve, 1.0) / wide, 0.0), slope, share, s
 
 
 def _minimise(function, seat, reach):
-    """The least point of `function` within `reach` of `seat` in [0, 1], by golden section.
+    """About the least point of `function` within `reach` of `seat` in [0, 1], by golden section.
 
-    The place is good to the square root of rounding, the value to rounding. A bracket's end counts where it is lower.
+    A bracket's end counts where it is lower.
     """
     golden = (math.sqrt(5) - 1) / 2
     low, high = jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0)
@@ -250,7 +257,7 @@ def _minimise(function, seat, reach):
         return low, high, jnp.where(better, points[lower], best), jnp.minimum(values[lower], least)
 
     start = (low, high, seat * jnp.ones_like(low), jnp.full_like(low, jnp.inf))
-    return stop_gradient(jax.lax.fori_loop(0, 40, narrow, start)[2])
+    return stop_gradient(jax.lax.fori_loop(0, GOLDEN, narrow, start)[2])
 
 
 def _first_loss(table, seen, duration, steps, values):
