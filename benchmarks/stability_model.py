@@ -233,7 +233,8 @@ class Model:
     def depth(self, z):
         """How deep contact edges, and how deep roots of fingers and ends of the palm, are in the object (0: outside).
 
-        Two arrays (scenes, places). The points looked at are the feet of all vertices on a contact edge, and its ends.
+        Two arrays (scenes, places). The points looked at are the feet of all vertices on a contact edge, its ends, and
+        the middles between the places where its line crosses the object's edges.
         """
         away, directions = self._poses(z)
         points = z[..., None, :2] + away
@@ -250,7 +251,15 @@ class Model:
             start = joint[:, None, link] + offset[:, None, link, None] * side[link] * quarter(d)
             reach = length[:, None, link, None]
             feet = np.where(real, np.clip(dot(d[:, :, None], points - start[:, :, None]), 0.0, reach), 0.0)
-            feet = np.concatenate([feet, np.broadcast_to(reach, (*z.shape[:2], 1))], axis=2)
+            feet = np.concatenate([feet, np.broadcast_to(reach, (*z.shape[:2], 1)), 0 * feet[:, :, :1]], axis=2)
+            aside = dot(quarter(d)[:, :, None], points - start[:, :, None])
+            other = dot(quarter(d)[:, :, None], following - start[:, :, None])
+            share = aside / np.where(aside == other, np.inf, aside - other)
+            meet = points + share[..., None] * (following - points)
+            crossed = real & (share >= 0) & (share <= 1)
+            crossings = np.where(crossed, np.clip(dot(d[:, :, None], meet - start[:, :, None]), 0.0, reach), 0.0)
+            stops = np.sort(np.concatenate([feet, crossings], axis=2), axis=2)
+            feet = np.concatenate([feet, (stops[..., 1:] + stops[..., :-1]) / 2], axis=2)
             probes = start[:, :, None] + feet[..., None] * d[:, :, None]
             worst = np.maximum(worst, _inside(probes, points, following, real).max(2))
             roots.append(start[:, :, None])

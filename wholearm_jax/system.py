@@ -19,12 +19,14 @@ class System(eqx.Module):
     """A formation on a hand, dimensionless but for time.
 
     `inertia` is the diagonal of `M = diag(m, m, I, J1, J2)`; `viscous` and `dry` are B and D; `gravity` is an
-    acceleration. `candidates` are all pairs that may touch; `watched` marks those that could end the formation.
+    acceleration. `candidates` are all pairs that may touch, `real` those of features that the object has; `watched`
+    marks those that could end the formation.
     `length` [m] and `mass` [kg] are the units; `torque_limit` stays in N m.
     """
 
     contacts: Contacts
     candidates: Contacts
+    real: Bool[Array, "candidates"]
     watched: Bool[Array, "candidates"]
     inertia: Float[Array, "5"]
     viscous: Float[Array, "2"]
@@ -77,6 +79,7 @@ def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Format
     return System(
         contacts=contacts(small_body, small_hand, formation),
         candidates=contacts(small_body, small_hand, pairs),
+        real=pairs.feature < body.count,
         watched=_watched(pairs, formation, body),
         inertia=jnp.concatenate([heavy, small_hand.inertia]),
         viscous=small_hand.viscous,

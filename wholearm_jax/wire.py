@@ -156,14 +156,32 @@ def _project(system, rough):
 
 
 def _misplaced(system, z):
-    """Whether a contact lies beyond its feature, or a vertex behind the palm or (of a convex object) a finger."""
+    """Whether a contact lies beyond its feature, a vertex behind the palm, or a finger in an object that is convex."""
     tolerance = digits(z, 5 / 8)
     held, pairs = frames(system.contacts, z), frames(system.candidates, z)
     beyond = (held.along < system.contacts.lower - tolerance) | (held.along > system.contacts.upper + tolerance)
     inside = (pairs.along > system.candidates.lower) & (pairs.along < system.candidates.upper)
     palm = system.candidates.finger.sum(1) == 0
-    behind = system.watched & system.candidates.on_link & inside & (pairs.gap < -tolerance)
-    return jnp.any(beyond) | jnp.any(behind & (palm | system.convex))
+    behind = system.watched & system.candidates.on_link & palm & inside & (pairs.gap < -tolerance)
+    return jnp.any(beyond) | jnp.any(behind) | (system.convex & _pierced(system, z, pairs.gap, tolerance))
+
+
+def _pierced(system, z, tip, tolerance):
+    """Whether part of a finger's contact edge lies within a convex object: behind all of its edges."""
+    several = system.candidates
+    root = frames(eqx.tree_at(lambda c: c.reach, several, jnp.zeros_like(several.reach)), z).gap
+    root, rise = root + tolerance, tip - root
+    cross = -root / jnp.where(rise == 0, 1.0, rise)  # where, from root (0) to tip (1), an edge's line is crossed
+    enter = jnp.where(rise < 0, cross, jnp.where((rise == 0) & (root > 0), jnp.inf, -jnp.inf))
+    leave = jnp.where(rise > 0, cross, jnp.inf)
+
+    def within(finger):
+        edges = ~several.on_link & (several.finger[:, finger] > 0) & system.real
+        first = jnp.where(edges, enter, -jnp.inf).max()
+        last = jnp.where(edges, leave, jnp.inf).min()
+        return jnp.minimum(last, 1.0) > jnp.maximum(first, 0.0)
+
+    return within(0) | within(1)
 
 
 def _dependent(system, z):
