@@ -70,7 +70,7 @@ class Level(NamedTuple):
     error: float
 
 
-QUICK = Level(Resolution(4, 12, 8), Integration(tolerance=1e-8, max_steps=96, stages=4), 5e-6)
+QUICK = Level(Resolution(4, 12, 8, 64), Integration(tolerance=1e-8, max_steps=96, stages=4), 5e-6)
 FULL = Level(Resolution(), Integration(), 1e-9)
 
 

@@ -263,10 +263,7 @@ def _crossings(system, before: Watched, after: Watched, step, tolerance):
     are told apart to 1e-13.
     """
     old, new = before.values, after.values
-    pairs = system.candidates.lower.shape[0]
-    inward = (old >= -tolerance) & (new < -tolerance)
-    outward = ((old < -tolerance) & (new >= -tolerance)).at[pairs:].set(False)  # out of the back of a link
-    through = inward | outward
+    through = (old >= -tolerance) & (new < -tolerance)
     slope = jnp.where(after.rates > before.rates, after.rates - before.rates, 1.0)
     turns = (before.rates < 0) & (after.rates > 0) & (old > tolerance)
     low = turns & (old - step * before.rates**2 / (2 * slope) < 0)
@@ -280,6 +277,7 @@ def _crossings(system, before: Watched, after: Watched, step, tolerance):
         rate = low + where * (2 * square + 3 * where * cube)
         better = where - (old + where * (low + where * (square + where * cube))) / jnp.where(rate < 0, rate, -1.0)
         where = jnp.where((rate < 0) & (better >= 0) & (better <= 1), better, where)
+    pairs = system.candidates.lower.shape[0]
     at = before.along + (after.along - before.along) * where[:pairs]
     inside = (at >= system.candidates.lower - tolerance) & (at <= system.candidates.upper + tolerance)
     counts = jnp.concatenate([inside & system.watched, jnp.ones(new.shape[0] - pairs, bool)])

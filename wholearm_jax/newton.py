@@ -48,7 +48,7 @@ def newton(function: Callable, z: Float[Array, "n"], *parameters, steps: int = 2
 
     def going(state):
         _, _, residual, count, size = state
-        return (count < steps) & (size > 4 * eps) & (residual > 0)
+        return (count < steps) & (size > eps**0.5625) & (residual > 0)  # what is left is of the square of the step
 
     far = jnp.asarray(jnp.inf, z.dtype)
     start = (stop_gradient(z), jnp.eye(z.shape[0], dtype=z.dtype), far, jnp.asarray(0), far)

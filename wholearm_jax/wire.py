@@ -335,13 +335,13 @@ def _cut(system, fixed, marched, places, start, resolution):
 
     def node(s, guess, u, anchor, anchor_s):
         height = u @ anchor + s - anchor_s
-        z, moved, inverted, _ = correct(fixed, u, guess, stop_gradient(height), 2)  # the guess has seven digits
+        z, moved, inverted, _ = correct(fixed, u, guess, stop_gradient(height), 2, digits(guess, 3 / 8))
 
         def equations(z, system, height):
             return jnp.concatenate([constraints(system.contacts, z), (u @ z - height)[None]])
 
         found = z - times(stop_gradient(inverted), equations(stop_gradient(z), system, height))
-        return found, moved, speeds_of(fixed, stop_gradient(found), inverted[:, 4])  # dz/ds is its last column
+        return found, moved, speeds_of(fixed, stop_gradient(found), _refined(fixed, stop_gradient(found), u, inverted))
 
     per_panel = jax.vmap(node, (0, 0, None, None, None))
     nodes, moved, speeds = jax.vmap(per_panel)(s, guess, chart[owner], anchor[owner], anchor_s[owner])
@@ -370,6 +370,13 @@ def _cut(system, fixed, marched, places, start, resolution):
         owner=owner,
         nodes=nodes,
     )
+
+
+def _refined(system, z, u, inverted):
+    """`dz/ds` in the chart `u`: the last column of `[G; u]^-1`, with an inverse from nearby mended by one step."""
+    x = inverted[:, 4]
+    rows = jnp.concatenate([constraint_rows(system.contacts, z), u[None]])
+    return x + times(inverted, jnp.zeros(5, z.dtype).at[4].set(1.0) - times(rows, x))
 
 
 def _panels(breaks, count, resolution):
