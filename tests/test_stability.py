@@ -1,5 +1,6 @@
 """Scenes at the edge: wires that turn far or meet another, wedging on the way back, tiny pieces, many stops."""
 
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,7 +12,8 @@ from test_gradients import nearest_difference
 
 import wholearm_jax as wa
 from wholearm_jax.contacts import gaps
-from wholearm_jax.forces import arc
+from wholearm_jax.forces import REFINED, SAMPLES, arc, score
+from wholearm_jax.march import Watched, crossings
 from wholearm_jax.motion import Integration, move
 from wholearm_jax.plan import end_configuration, outcomes, prepare
 from wholearm_jax.reduction import balance, blank, horner, powers
@@ -198,6 +200,55 @@ def test_a_step_as_short_as_rounding_keeps_its_speed():
     slope = np.polynomial.polynomial.polyder(np.asarray(quintic))
     speed = np.polynomial.polynomial.polyval(np.linspace(0, 1, 7), slope) / float(share[1] - share[0])
     np.testing.assert_allclose(speed, 1.5, rtol=1e-12)
+
+
+def test_a_dip_between_samples_is_found_among_many_low_steps():
+    """One piece of many has a force that falls from above all others' to far below them within a third of a step."""
+    count, deep, floor = 2 * REFINED, REFINED + 1, 0.3
+    table, seen = track(np.append(np.arange(count), 99.0), np.ones(count))
+    motion = move(table, seen, jnp.asarray(1.0), how=Integration(), speed=float(count - 1))
+    places = np.asarray(motion.s)[: int(motion.count) + 1]
+    last = np.searchsorted(places, deep + 1.0)
+    half = (places[last] - places[last - 1]) / (SAMPLES - 1)  # in xi, which goes from -1 to 1 in every piece
+    lowest = 2 * ((places[last] + places[last - 1]) / 2 - deep) - 1 + half
+    steepness = 8.0 / half**2
+    forces = np.zeros((count, 4, 4, 5))
+    forces[:, 0, :, 0] = 1.0
+    forces[deep, :3, 2, 0] = [floor + steepness * lowest**2, -2 * steepness * lowest, steepness]
+    table = eqx.tree_at(lambda t: t.force, table, jnp.asarray(forces))
+    found = score(table, seen, jnp.asarray(1.0), motion, Integration())
+    assert float(found.margin) == pytest.approx(floor, abs=1e-9)
+    assert int(found.contact) == 2
+    assert float(found.s) == pytest.approx(deep + (lowest + 1) / 2, abs=1e-6)
+
+
+def test_what_passes_and_comes_back_within_a_step_is_met_on_its_way_down():
+    """A vertex that grazes a finger: it dips through soon, and is back to rounding where the step ends."""
+    pairs = SimpleNamespace(lower=jnp.zeros(1), upper=jnp.ones(1))
+    watched = SimpleNamespace(candidates=pairs, watched=jnp.array([True]))
+    step, inside = 2e-3, jnp.array([0.5])
+    gap = np.polynomial.Polynomial.fromroots([0.3 * step, 0.999999 * step])
+    steady = jnp.array([1.0])  # some room that nothing changes
+
+    def at(s):
+        values, rates = jnp.array([gap(s)]), jnp.array([gap.deriv()(s)])
+        return Watched(jnp.append(values, steady), jnp.append(rates, 0.0), inside)
+
+    assert gap(step) > 0 > gap(0.5 * step)
+    for end in (step, 0.999 * step):  # back outside, and not yet
+        crossed, where = crossings(watched, at(0.0), at(end), end, 1e-16)
+        assert list(np.asarray(crossed)) == [True, False]
+        assert float(where[0] * end) == pytest.approx(0.3 * step, rel=1e-9)
+
+
+@pytest.mark.parametrize(("angle", "status"), [(np.pi / 2, "ok"), (np.pi - 0.2, "left_formation")])
+def test_a_finger_may_not_pierce_the_object(angle, status):
+    """A square that the palm and one finger hold, and the other finger beside it, or through two of its edges."""
+    square = [[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]
+    contacts = ["palm:v0", "palm:v1", "finger2:v0", "finger2:v3"]
+    start = [0.0, 0.5, 0.0, angle, np.pi / 2]
+    beside = scene(square, contacts, "theta1+", start, joint=(2.0, -0.5), length=3.0)
+    assert wa.Status(int(wa.trace(beside)[0].table.status)).label == status
 
 
 def test_too_few_steps_are_always_said():

@@ -169,7 +169,7 @@ def _step(system, watch, tolerance, m: March) -> March:
     x_new, orientation = _normalised(inverted, determinant)
     watched = watch(z_new, x_new, u)
     good = (moved < tolerance) & (x_new @ x > 0.98) & jnp.all(jnp.isfinite(x_new))
-    crossed, _ = _crossings(system, m.before, watched, m.step, tolerance)
+    crossed, _ = crossings(system, m.before, watched, m.step, tolerance)
     ends = good & jnp.any(crossed)
     bracketed = ends & (m.step <= SHORTEST)
     accept = good & ~jnp.any(crossed)
@@ -226,7 +226,7 @@ def _ended(system, m: March, tolerance) -> March:
     """What ends the wire first between the last two nodes of a march, and about where."""
     low, high = jnp.maximum(m.n - 2, 0), jnp.maximum(m.n - 1, 1)
     step = jnp.where(m.status == 0, m.s[high] - m.s[low], 1.0)
-    crossed, where = _crossings(system, m.before, m.beyond, step, tolerance)
+    crossed, where = crossings(system, m.before, m.beyond, step, tolerance)
     first = jnp.argmin(jnp.where(crossed, where, jnp.inf))
     z = m.z[low] + (m.z[high] - m.z[low]) * where[first]
     found = (m.status == 0) & jnp.any(crossed)
@@ -256,7 +256,7 @@ def correct(system: System, u, z, height, steps: int, enough=0.0):
     return z, jnp.where(jnp.isfinite(moved), moved, jnp.inf), inverted, determinant
 
 
-def _crossings(system, before: Watched, after: Watched, step, tolerance):
+def crossings(system, before: Watched, after: Watched, step, tolerance):
     """Which watched values turn negative within a step (or dip below zero and return), and at what share of it.
 
     The share is a root of the cubic through values and rates: several things that end a wire within the shortest step
