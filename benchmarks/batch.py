@@ -3,12 +3,14 @@ r"""Many scenes: how many a second one schedule is checked against, and what lim
     python benchmarks/batch.py [--quick]
 
 The heptagon's whole plan (two phases, 2 s), every wire traced anew, vertices within 0.2 mm and friction within 10 %, in
-one process: checks over the size of the batch, checks with the gradient of the margin with respect to all torques,
-optimisations, one process against two, the largest difference of a margin from the full resolution, compile times (the
-first call's, nothing kept) and peak memory. Beside them MuJoCo's rollouts of the same plan with the same scenes on all
-threads, at the longest of some time steps whose object ends within 1 % of its way from the prediction (`pose`), and at
-the longest whose least force is within 1 % of the predicted one, or else the shortest (`margin`; phases are of equal
-length, and twentieths of a phase at its ends are left out, where soft contacts take over).
+one process with a device for each processor: checks over the size of the batch, on one device as well, beside what two
+gain for arithmetic alone; checks of objects that differ in friction and mass alone; checks with the gradient of the
+margin with respect to all torques, optimisations, one process against two, the largest difference of a margin from the
+full resolution, compile times (the first call's, nothing kept) and peak memory. Beside them MuJoCo's rollouts of the
+same plan with the same scenes on all threads, at the longest of some time steps whose object ends within 1 % of its way
+from the prediction (`pose`), and at the longest whose least force is within 1 % of the predicted one, or else the
+shortest (`margin`; phases are of equal length, and twentieths of a phase at its ends are left out, where soft contacts
+take over).
 """
 
 import argparse
@@ -26,6 +28,7 @@ import jax
 import matplotlib.pyplot as plt
 import measure
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 
 import wholearm_jax as wa
 from wholearm_jax.batch import BLOCK, QUICK, check_scene
@@ -35,7 +38,8 @@ from wholearm_jax.variation import vary
 jax.config.update("jax_enable_x64", True)
 
 HERE = Path(__file__).parent
-COUNTS = (128, 1024, 8192)
+COUNTS = (128, 1024, 8192, 65_536)
+ALIKE = 65_536
 OPTIMISED = 3
 VARIED = {"vertices": 0.0002, "friction": "10%"}
 STEPS = (1.6e-3, 8e-4, 4e-4, 2e-4, 1e-4, 5e-5)
@@ -64,6 +68,48 @@ def checks(ensemble, torque, counts) -> dict:
     error = float(np.abs(quick.margin - full.margin).max())
     print(f"first call {first:.1f} s, error of a margin {error:.1e} N", flush=True)
     return {"first": first, "error": error, "rows": rows}
+
+
+def scaling(ensemble, torque) -> dict:
+    """What all devices gain over one: for checks, and for arithmetic without any memory to speak of."""
+
+    def arithmetic(devices) -> float:
+        mesh, each = Mesh(np.asarray(devices), ("scenes",)), PartitionSpec("scenes")
+        many = jax.lax.fori_loop
+        loop = jax.shard_map(
+            lambda x: many(0, 200_000, lambda _, x: x * x - 0.5, x), mesh=mesh, in_specs=each, out_specs=each
+        )
+        run, start = jax.jit(loop), np.full(256 * len(devices), 0.1)
+        jax.block_until_ready(run(start))
+        begun = time.perf_counter()
+        jax.block_until_ready(run(start))
+        return len(devices) / (time.perf_counter() - begun)
+
+    def check(devices) -> float:
+        count = 8 * BLOCK * len(devices)
+        wa.check(ensemble, torque, count=BLOCK, arrival=ARRIVAL, devices=devices)
+        begun = time.perf_counter()
+        wa.check(ensemble, torque, count=count, arrival=ARRIVAL, devices=devices)
+        return count / (time.perf_counter() - begun)
+
+    every, found = jax.devices(), {"devices": len(jax.devices())}
+    for name, part in (("check", check), ("arithmetic", arithmetic)):
+        pairs = [(part(every[:1]), part(every)) for _ in range(3)]
+        gains = [all_of_them / one for one, all_of_them in pairs]
+        found[name] = {"gain": float(np.median(gains)), "one": float(np.median([one for one, _ in pairs]))}
+        print(f"{len(every)} devices over one, {name}: {found[name]['gain']:.2f}", flush=True)
+    return found
+
+
+def same_geometry(torque) -> dict:
+    """Checks of objects that differ in friction and mass alone: their wires are one another's."""
+    ensemble = vary(wa.load("heptagon"), {"mass": "5%", "friction": "10%"}, seed=1)
+    wa.check(ensemble, torque, count=BLOCK, arrival=ARRIVAL)
+    begun = time.perf_counter()
+    wa.check(ensemble, torque, count=ALIKE, arrival=ARRIVAL)
+    rate = ALIKE / (time.perf_counter() - begun)
+    print(f"friction and mass alone: {rate:.0f} a second, {memory():.0f} MiB", flush=True)
+    return {"count": ALIKE, "rate": rate, "memory": memory()}
 
 
 def gradients(ensemble, torque) -> dict:
@@ -196,8 +242,9 @@ def main() -> None:
     """Measure, save, draw, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small batches of checks alone; nothing is written")
-    parser.add_argument("--only", help="measure this part anew: check, mujoco, gradient, optimise or processes")
+    parser.add_argument("--only", help="measure this part anew, e.g. check")
     given = parser.parse_args()
+    jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are to be fresh
     ensemble, file = vary(wa.load("heptagon"), VARIED, seed=1), HERE / "data" / "heptagon_knots.csv"
     torque = wa.read_torque(file)
@@ -206,6 +253,8 @@ def main() -> None:
         return
     parts = {
         "check": lambda: checks(ensemble, torque, COUNTS),
+        "scaling": lambda: scaling(ensemble, torque),
+        "same_geometry": lambda: same_geometry(torque),
         "mujoco": lambda: rollouts(ensemble, torque),
         "gradient": lambda: gradients(ensemble, torque),
         "optimise": lambda: optimisations(ensemble),

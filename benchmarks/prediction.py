@@ -11,9 +11,9 @@ wire's end early, and at speed, is left out: its plan says nothing about the imp
 
 What counts, by the same tolerances on both sides:
 
-- *predicted to hold*: no contact force is tensile for `FREE` running while its phase lasts (`MARGIN_OF_TIME` at its ends
-  left out), no impulse pulls, no hold is infeasible, and every phase ends within `TOLERANCE` (0.5 mm, 0.01 rad) of its
-  wire's end;
+- *predicted to hold*: no contact force is tensile for `FREE` running while its phase lasts (`MARGIN_OF_TIME` at either
+  end left out), no impulse pulls, no hold is infeasible, and every phase ends within `TOLERANCE` (0.5 mm, 0.01 rad) of
+  its wire's end;
 - *executed to hold*: `execution.execute` at 0.05 ms ends `ok` (within the same tolerance, the last contacts closed to
   0.5 mm), and no contact of a formation was without force for `FREE` running, its phase's ends left out alike.
 
@@ -69,7 +69,8 @@ UNDECIDED = {Status.AMBIGUOUS, Status.SINGULAR, Status.NO_CONVERGENCE, Status.MA
 class Predicted(NamedTuple):
     """What the model says.
 
-    `holds` (None: left out), and the same if a force may not be tensile at any moment (`strict`); the least force and the mean force [N]; the longest such time `dip` [s], where
+    `holds` (None: left out), and the same if a force may not be tensile at any moment (`strict`); the least force and
+    the mean force [N]; the longest time `dip` [s] for which a force is tensile while formations do not change, where
     the least force is (share of its phase), and how far from the planned end, over the tolerance, the object comes.
     """
 

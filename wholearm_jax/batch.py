@@ -32,6 +32,7 @@ from wholearm_jax.plan import (
     require_x64,
     run,
     simulate,
+    steps_within,
 )
 from wholearm_jax.scene import Formation, Heading, Scene, body
 from wholearm_jax.schedule import Torque, padded
@@ -176,7 +177,7 @@ def check_chunks(
 
 def _check_rows(source, rows, torque: Torque, arrival, levels, mesh) -> Checked:
     """Check some scenes, level by level; those of the last that are not good, alone."""
-    schedule, steps = padded(torque), bool(np.any(np.diff(np.asarray(torque.times)) == 0))
+    schedule, steps = padded(torque), _steps_within(source, torque)
     found, left = None, np.arange(len(rows))
     for level in levels:
         level = level._replace(how=replace(level.how, steps=steps))
@@ -195,6 +196,15 @@ def _check_rows(source, rows, torque: Torque, arrival, levels, mesh) -> Checked:
         for column, new in zip(found, alone, strict=True):
             column[row] = new
     return found
+
+
+def _steps_within(source, torque: Torque) -> bool:
+    """Whether the schedule steps within a phase of some scene."""
+    if isinstance(source, Ensemble):
+        return steps_within(source.scene, torque)  # ensembles have one scene's durations
+    if any(np.ptp(phase.duration) > 0 for phase in source.scenes.phases):
+        return bool(np.any(np.diff(torque.times) == 0))
+    return steps_within(source.draw(jnp.asarray(0)), torque)
 
 
 def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):

@@ -2,13 +2,14 @@
 `wholearm optimise --robust`.
 
 Every process of a run (`--coordinator`, or SLURM's variables) takes each `--processes`-th chunk; the first one makes
-the store and tells what became of all. Several processors are put to use by as many processes.
+the store and tells what became of all. Each process has one device for every processor that it may run on.
 """
 
 import os
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -43,6 +44,7 @@ def check(
     """Check a schedule against many variants of a scene; the same command goes on with a store it left unfinished."""
     if (polygons is None) == (count is None) or (polygons is not None and vary):
         raise BadInput("check: give either --count, with --vary QUANTITY=AMOUNT, or --polygons FILE.npz")
+    _use_all_processors()
     place = _join(coordinator, processes, process)
     try:
         import zarr  # noqa: F401
@@ -144,6 +146,17 @@ def ensemble(scene, amounts: list[str] | None, seed: int):
         return vary(scene, {name.strip(): amount.strip() for name, _, amount in pairs}, seed=seed)
     except ValueError as error:
         raise BadInput(f"{error}") from None
+
+
+def _use_all_processors() -> None:
+    """One device for each processor, unless JAX has been told how many there are."""
+    import jax
+
+    told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if not told and jax.config.values["jax_num_cpu_devices"] < 0:
+        mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+        with suppress(RuntimeError):  # in a process that has used JAX before, it stays at what there is
+            jax.config.update("jax_num_cpu_devices", len(mine))
 
 
 def _join(coordinator: str | None, processes: int | None, process: int | None) -> _Place:

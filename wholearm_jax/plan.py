@@ -374,7 +374,12 @@ def steps_within(scene: Scene, torque: Torque) -> bool:
     times = [torque.times, *(phase.duration for phase in scene.phases)]
     if any(isinstance(one, jax.core.Tracer) for one in times):
         return False
-    return any(has_steps(torque, start, end) for start, end in _spans(scene))
+    begins, first = [], 0.0
+    for before, (start, _) in zip([None, *scene.phases], _spans(scene), strict=False):
+        # Who passes on at speed may do so early: then the next phase has what was meant for it.
+        first = first if before is not None and before.arrive == "moving" else start
+        begins.append(first)
+    return any(has_steps(torque, first, end) for first, (_, end) in zip(begins, _spans(scene), strict=True))
 
 
 def describe(scene: Scene, torque: Torque, traced, found) -> Result:

@@ -10,7 +10,7 @@ compression while each phase lasts and the phase ends within a share `arrival` o
 speed that fits (`verdict`); the next phase then starts at rest at the end, as in every plan.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 from wholearm_jax.forces import smooth_margin
 from wholearm_jax.motion import Integration
 from wholearm_jax.optimiser import optimise
-from wholearm_jax.plan import Traced, outcomes, trace
+from wholearm_jax.plan import Traced, outcomes, steps_within, trace
 from wholearm_jax.schedule import Torque
 from wholearm_jax.status import Status
 from wholearm_jax.variation import Ensemble
@@ -31,7 +31,7 @@ from wholearm_jax.verdict import BRAKING
 from wholearm_jax.wire import Resolution
 
 COARSE = Resolution(6, 24, 8)
-HOW = Integration(tolerance=1e-7, max_steps=128, stages=6, adjoint="both", steps=True)
+HOW = Integration(tolerance=1e-7, max_steps=128, stages=6, adjoint="both")
 WITHIN = 0.5  # share of the tolerance of arrival that the climb leaves as it is
 NONE = -10.0  # margin [N] of a phase without any motion
 TEMPERATURE = 0.02  # of the smooth minimum, as a share of the nominal margin
@@ -75,7 +75,8 @@ def optimise_robustly(
     scene = ensemble.scene
     start = optimise(scene, knots=knots).torque if nominal is None else nominal
     seen, unseen = (_traced(ensemble, jnp.arange(samples) + first) for first in (0, samples))
-    tried = jax.jit(lambda torque, traced: _climb(torque, scene, traced, jnp.asarray(arrival)))
+    how = replace(HOW, steps=steps_within(scene, start))
+    tried = jax.jit(lambda torque, traced: _climb(torque, scene, traced, jnp.asarray(arrival), how))
 
     def held(found) -> Held:
         return Held(float(found.holds.mean()), float(jnp.quantile(found.margins, quantile, method="lower")))
@@ -117,12 +118,12 @@ def _traced(ensemble: Ensemble, numbers) -> tuple[Traced, ...]:
     return jax.lax.map(lambda n: trace(ensemble.draw(n), resolution=COARSE), numbers, batch_size=32)
 
 
-def _climb(torque: Torque, scene, traced, arrival) -> _Climbed:
+def _climb(torque: Torque, scene, traced, arrival, how: Integration) -> _Climbed:
     """How a schedule does on all samples, and which way it gets better."""
 
     def objective(values) -> tuple[Float[Array, ""], tuple]:
         def one(at):
-            found = outcomes(scene, Torque(torque.times, values), at, HOW, arrival)
+            found = outcomes(scene, Torque(torque.times, values), at, how, arrival)
             least = jnp.stack([jnp.where(jnp.isfinite(o.score.margin), o.score.margin, NONE) for o in found]).min()
             missed = jnp.stack([_missed(o, t.table, arrival) for o, t in zip(found, at, strict=True)]).sum()
             holds = jnp.stack([o.verdict.status == int(Status.OK) for o in found]).all()
