@@ -42,7 +42,7 @@ COUNTS = (128, 1024, 8192, 65_536)
 ALIKE = 65_536
 OPTIMISED = 3
 VARIED = {"vertices": 0.0002, "friction": "10%"}
-STEPS = (1.6e-3, 8e-4, 4e-4, 2e-4, 1e-4, 5e-5)
+STEPS = (1.6e-3, 8e-4, 4e-4, 2e-4, 1e-4, 5e-5, 2.5e-5, 1.25e-5)
 ROLLOUTS = 16
 ARRIVAL = 0.02
 

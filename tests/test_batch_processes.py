@@ -76,18 +76,17 @@ def test_killed_at_any_moment_it_goes_on_to_the_same_store(command, whole, tmp_p
     assert contents(path) == whole
 
 
-def test_two_processes_leave_what_one_does(command, whole, tmp_path):
+@pytest.mark.parametrize("number", [2, 4])
+def test_several_processes_leave_what_one_does(command, whole, tmp_path, number):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    path = tmp_path / "two.zarr"
-    both = [
-        start(command, path, "--coordinator", address, "--processes", "2", "--process", str(number))
-        for number in (0, 1)
-    ]
-    said = [finish(process) for process in both]
-    assert f"of {COUNT} hold" in said[0]
-    assert "hold" not in said[1]
+    path = tmp_path / "several.zarr"
+    joined = ["--coordinator", address, "--processes", str(number), "--process"]
+    running = [start(command, path, *joined, str(k)) for k in range(number)]
+    first, *others = [finish(process) for process in running]
+    assert f"of {COUNT} hold" in first
+    assert all("hold" not in said for said in others)
     assert contents(path) == whole
 
 
