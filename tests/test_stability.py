@@ -251,6 +251,18 @@ def test_a_finger_may_not_pierce_the_object(angle, status):
     assert wa.Status(int(wa.trace(beside)[0].table.status)).label == status
 
 
+def test_a_convex_object_is_not_held_by_a_finger_s_back():
+    """A flat polygon whose vertex touches a finger without being pierced, and which lies behind it."""
+    upper = [[1.0, -0.0094], [0.8911, 0.0653], [0.5899, 0.1157], [-0.0242, 0.143], [-0.5023, 0.1234], [-0.864, 0.0709]]
+    lower = [[-0.9937, -0.0105], [-0.7571, -0.0936], [-0.3774, -0.1331], [0.2584, -0.1392], [0.6787, -0.1061]]
+    contacts = ["finger1:v0", "finger2:v2", "palm:v1", "palm:v2"]
+    start = [0.8951, 0.7397, -2.3001, 1.4571, 0.5759]
+    joints, offset = (1.58917, -0.60079), (0.25245, 0.0)
+    near = scene(upper + lower, contacts, "theta1+", start, joint=joints, length=1.86075, offset=offset)
+    near = eqx.tree_at(lambda s: s.hand.joint, near, near.hand.joint.at[0, 1].set(-0.38341))
+    assert int(wa.trace(near)[0].table.status) == wa.Status.LEFT_FORMATION
+
+
 def test_too_few_steps_are_always_said():
     """A phase of several pieces that needs more steps than the record holds says `max_steps`, or is right."""
     table, seen = track([0.0, 1.0, 2.0, 99.0], [1.0, 1.0, 1.0], knots=9)

@@ -156,13 +156,18 @@ def _project(system, rough):
 
 
 def _misplaced(system, z):
-    """Whether a contact lies beyond its feature, a vertex behind the palm, or a finger in an object that is convex."""
+    """Whether a contact lies beyond its feature, a vertex behind the palm, or a convex object on a finger or behind it.
+
+    Behind a finger's line, vertices of a convex object may lie where the finger's tip touches an edge, not where a
+    vertex touches the finger.
+    """
     tolerance = digits(z, 5 / 8)
     held, pairs = frames(system.contacts, z), frames(system.candidates, z)
     beyond = (held.along < system.contacts.lower - tolerance) | (held.along > system.contacts.upper + tolerance)
     inside = (pairs.along > system.candidates.lower) & (pairs.along < system.candidates.upper)
-    palm = system.candidates.finger.sum(1) == 0
-    behind = system.watched & system.candidates.on_link & palm & inside & (pairs.gap < -tolerance)
+    of_finger, held_by = system.candidates.finger > 0, (system.contacts.finger > 0) & system.contacts.on_link[:, None]
+    faces = ~of_finger.any(1) | (system.convex & (of_finger & held_by.any(0)).any(1))  # in front of them all must be
+    behind = system.watched & system.candidates.on_link & faces & inside & (pairs.gap < -tolerance)
     return jnp.any(beyond) | jnp.any(behind) | (system.convex & _pierced(system, z, pairs.gap, tolerance))
 
 
