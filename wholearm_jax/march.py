@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.contacts import constraint_rows, constraints, frames, slips
@@ -233,7 +234,7 @@ def _ended(system, m: March, tolerance) -> March:
     return m._replace(end=jnp.where(found, first, -1), end_z=jnp.where(found, z, m.end_z))
 
 
-def correct(system: System, u, z, height, steps: int, enough=0.0):
+def correct(system: System, u, z, height, steps: int, enough: ArrayLike = 0.0):
     """Newton in the chart, until a step is no larger than `enough`: the place of the wire on the plane `u.z = height`.
 
     Beside it the last step's size, and `[G; u]^-1` and its determinant before that step.

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from wholearm_jax.forces import Score, arcs, force, on_arc, score
@@ -372,7 +373,7 @@ def simulate(
 def steps_within(scene: Scene, torque: Torque) -> bool:
     """Whether a schedule steps within a phase; times and durations that are being transformed count as they do not."""
     times = [torque.times, *(phase.duration for phase in scene.phases)]
-    if any(isinstance(one, jax.core.Tracer) for one in times):
+    if any(isinstance(one, Tracer) for one in times):
         return False
     begins, first = [], 0.0
     for before, (start, _) in zip([None, *scene.phases], _spans(scene), strict=False):
