@@ -73,12 +73,12 @@ def checks(ensemble, torque, counts) -> dict:
 def scaling(ensemble, torque) -> dict:
     """What all devices gain over one: for checks, and for arithmetic without any memory to speak of."""
 
+    def squares(x):
+        return jax.lax.fori_loop(0, 200_000, lambda _, x: x * x - 0.5, x)
+
     def arithmetic(devices) -> float:
         mesh, each = Mesh(np.asarray(devices), ("scenes",)), PartitionSpec("scenes")
-        many = jax.lax.fori_loop
-        loop = jax.shard_map(
-            lambda x: many(0, 200_000, lambda _, x: x * x - 0.5, x), mesh=mesh, in_specs=each, out_specs=each
-        )
+        loop = jax.shard_map(squares, mesh=mesh, in_specs=each, out_specs=each)
         run, start = jax.jit(loop), np.full(256 * len(devices), 0.1)
         jax.block_until_ready(run(start))
         begun = time.perf_counter()

@@ -32,11 +32,11 @@ import numpy as np
 from scipy.special import beta, betainc
 
 import wholearm_jax as wa
-from wholearm_jax.motion import Integration
-from wholearm_jax.plan import run
+from wholearm_jax.phase import run
 from wholearm_jax.reduction import Table
 from wholearm_jax.schedule import padded
 from wholearm_jax.squeeze import holds
+from wholearm_jax.stepping import Integration
 
 jax.config.update("jax_enable_x64", True)
 

@@ -20,7 +20,7 @@ from random_plans import _grasps, random_object, write
 
 import wholearm_jax as wa
 from wholearm_jax.formations import Way, leaving, ways
-from wholearm_jax.plan import start_configuration
+from wholearm_jax.phase import start_configuration
 from wholearm_jax.scene import Phase, formation, heading
 from wholearm_jax.scene_file import to_dict
 

@@ -39,8 +39,10 @@ from random_plans import plans as stopping_plans
 import wholearm_jax as wa
 from wholearm_jax.execution import Ending, Tolerance, execute
 from wholearm_jax.palette import LINK_COLOURS as COLOURS
-from wholearm_jax.plan import Result, end_configuration, sample, start_configuration
+from wholearm_jax.phase import end_configuration, start_configuration
 from wholearm_jax.proportion import wilson
+from wholearm_jax.result import Result
+from wholearm_jax.sampling import sample
 from wholearm_jax.schedule import padded
 from wholearm_jax.squeeze import coefficients
 from wholearm_jax.status import Status

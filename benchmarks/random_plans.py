@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 import wholearm_jax as wa
-from wholearm_jax.plan import ending
+from wholearm_jax.phase import ending
 from wholearm_jax.scene_file import to_dict
 
 jax.config.update("jax_enable_x64", True)

@@ -19,10 +19,11 @@ import numpy as np
 from work_precision import problems
 
 import wholearm_jax as wa
-from wholearm_jax import plan
 from wholearm_jax.forces import force, score
 from wholearm_jax.motion import move
+from wholearm_jax.phase import end_configuration, prepare
 from wholearm_jax.reduction import horner, powers
+from wholearm_jax.sampling import SAMPLED, sample
 from wholearm_jax.scene import body
 from wholearm_jax.schedule import interval, torque_in
 from wholearm_jax.wire import Resolution
@@ -91,13 +92,13 @@ def rows(problem, repeats: int) -> list[dict]:
     """Every comparison on one phase: times of both sides [s] and their ratio."""
     table, seen, duration = problem.traced.table, problem.seen, problem.duration
     scene, phase = problem.scene, problem.scene.phases[problem.phase]
-    rough = plan.end_configuration(wa.trace(scene)[problem.phase - 1]) if problem.phase else scene.start
+    rough = end_configuration(wa.trace(scene)[problem.phase - 1]) if problem.phase else scene.start
     solid = body(scene.object)
 
     def prepared(resolution):
-        return plan.prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, resolution)
+        return prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, resolution)
 
-    shares = np.linspace(0.0, 1.0, plan.SAMPLED)
+    shares = np.linspace(0.0, 1.0, SAMPLED)
     motion = moved(table, seen, duration)
     gradient = jax.jit(jax.value_and_grad(lambda v: _margin(table, seen, duration, v)))
     calls = {
@@ -107,7 +108,7 @@ def rows(problem, repeats: int) -> list[dict]:
         "the trajectory, when the margin is asked": (
             lambda: (
                 scored(table, seen, duration),
-                plan.sample(table, problem.schedule, problem.start, duration, motion, shares),
+                sample(table, problem.schedule, problem.start, duration, motion, shares),
             ),
             "margin",
         ),

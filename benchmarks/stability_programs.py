@@ -15,11 +15,13 @@ from jaxtyping import Array, Float
 from stability_scenes import Scenes
 
 from wholearm_jax.forces import arcs, force, on_arc, score
-from wholearm_jax.motion import Integration, acceleration, move
+from wholearm_jax.landing import acceleration
+from wholearm_jax.motion import move
 from wholearm_jax.reduction import Table, change, horner, powers, reduce_wire
 from wholearm_jax.scene import Formation, Hand, Heading, Polygon, body
 from wholearm_jax.schedule import Torque, torque_in, window
 from wholearm_jax.squeeze import holds
+from wholearm_jax.stepping import Integration
 from wholearm_jax.system import configuration_unit, system
 from wholearm_jax.verdict import GOALS, judge
 from wholearm_jax.wire import Resolution, Wire, trace_wire

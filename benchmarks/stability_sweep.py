@@ -14,7 +14,7 @@ from stability_model import Model, dot
 from stability_programs import FLOATS, GAUSS, follower, forward, reverse, tracer
 from stability_scenes import Scenes, draw
 
-from wholearm_jax.motion import Integration
+from wholearm_jax.stepping import Integration
 from wholearm_jax.wire import Resolution
 
 REASONS = (

@@ -39,12 +39,15 @@ import numba_loop
 import numpy as np
 
 import wholearm_jax as wa
-from wholearm_jax import plan, scene_file
-from wholearm_jax.motion import Integration, Motion, move
+from wholearm_jax import scene_file
+from wholearm_jax.motion import Motion, move
+from wholearm_jax.phase import Traced, prepare, run
 from wholearm_jax.reduction import Table
+from wholearm_jax.sampling import sample
 from wholearm_jax.scene import body
 from wholearm_jax.schedule import Torque, Window, padded, window
 from wholearm_jax.status import Status
+from wholearm_jax.stepping import Integration
 from wholearm_jax.system import system
 
 jax.config.update("jax_enable_x64", True)
@@ -82,7 +85,7 @@ class Problem:
     name: str
     scene: wa.Scene
     phase: int
-    traced: plan.Traced
+    traced: Traced
     schedule: Torque
     start: jax.Array
     duration: jax.Array
@@ -106,7 +109,7 @@ def _problem(scene, traced, phase, kind, unreduced, referred) -> Problem:
     given = wa.read_torque(HERE / "data" / f"heptagon_{kind}.csv")
     start, duration = jnp.asarray(float(phase)), jnp.asarray(float(scene.phases[phase].duration))
     schedule = padded(given)
-    outcome = plan.run(traced[phase].table, schedule, start, duration, Integration(tolerance=1e-13), "moving")
+    outcome = run(traced[phase].table, schedule, start, duration, Integration(tolerance=1e-13), "moving")
     assert not bool(outcome.motion.held[0]), "the references do not wait"
     end = float(outcome.motion.share[int(outcome.motion.count)])
     stop = min(STOP.get(kind, 1.0), end)
@@ -166,7 +169,7 @@ def _move(table: Table, seen: Window, duration, how: wa.Integration) -> Motion:
 @eqx.filter_jit
 def _at_steps(table: Table, schedule, start, duration, motion: Motion):
     """`z`, `z_dot`, `c_n` at the motion's steps."""
-    there = plan.sample(table, schedule, start, duration, motion, motion.share)
+    there = sample(table, schedule, start, duration, motion, motion.share)
     return there.z, there.z_dot, there.cn
 
 
@@ -188,12 +191,12 @@ def package(problem: Problem, solver: str, tolerance: float):
     rough = rough * system_of(scene, problem.phase).configuration_unit
 
     def again():
-        traced = plan.prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading)
-        return plan.run(traced.table, *here, how, "moving")
+        traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading)
+        return run(traced.table, *here, how, "moving")
 
     calls = {
         "package": lambda: _move(table, problem.seen, problem.duration, how),
-        "package, run": lambda: plan.run(table, *here, how, "moving"),
+        "package, run": lambda: run(table, *here, how, "moving"),
         "package, trace and run": again,
     }
     return error(problem, *rows), count, calls
@@ -207,7 +210,7 @@ def between(problem: Problem, tolerance: float) -> dict[str, float]:
     last = min(problem.stop, float(motion.share[int(motion.count)]))
     shares = jnp.linspace(0.0, last * (1 - 1e-12), 401)
     here = (problem.traced.table, problem.schedule, problem.start, problem.duration, motion)
-    there = plan.sample(*here, shares)
+    there = sample(*here, shares)
     wrong = error(problem, *(np.asarray(a) for a in (shares, there.z, there.z_dot, there.cn)))
     return {"tolerance": tolerance, "error": wrong}
 
@@ -232,10 +235,10 @@ def direct(problem: Problem, solver: str, tolerance: float):
 def unreduced(problem: Problem, tolerance: float) -> dict:
     """SciPy on the un-reduced equations; it takes seconds, so it runs once, error and time alike."""
     begun = time.perf_counter()
-    run = problem.follow(problem.stop * float(problem.duration), tolerance)
+    followed = problem.follow(problem.stop * float(problem.duration), tolerance)
     seconds = time.perf_counter() - begun
-    times = np.unique(np.concatenate([s[2].ts for s in run.segments]))
-    states = (np.array(c) for c in zip(*(run.at(t) for t in times), strict=True))
+    times = np.unique(np.concatenate([s[2].ts for s in followed.segments]))
+    states = (np.array(c) for c in zip(*(followed.at(t) for t in times), strict=True))
     wrong = error(problem, times / float(problem.duration), *states)
     row = {"solver": "DOP853", "tolerance": tolerance, "error": wrong, "steps": len(times) - 1}
     return row | {"seconds": seconds}

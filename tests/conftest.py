@@ -14,6 +14,11 @@ jax.config.update("jax_enable_x64", True)
 command.compile_quickly()
 
 
+def pytest_collection_modifyitems(items):
+    """Notebooks first: the longest tests, at the end, would leave one worker alone with them."""
+    items.sort(key=lambda item: "test_notebooks" not in item.nodeid)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _programs_are_kept(request):
     """Workers share compiled programs, and so does the next run: most of the suite's time is compiling."""

@@ -6,8 +6,10 @@ import pytest
 import unreduced
 
 import wholearm_jax
-from wholearm_jax import plan, scene_file, squeeze
-from wholearm_jax.motion import Integration
+from wholearm_jax import scene_file, squeeze
+from wholearm_jax.phase import run
+from wholearm_jax.sampling import sample
+from wholearm_jax.stepping import Integration
 
 DURATION = 1.0
 
@@ -48,31 +50,31 @@ def compared(name, phase, tolerance, samples):
     scene = SCENES[name]()
     table = wholearm_jax.trace(scene)[phase].table
     torque, start, length = passing(table), jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = plan.run(table, torque, start, length, Integration(tolerance=tolerance), "moving").motion
+    motion = run(table, torque, start, length, Integration(tolerance=tolerance), "moving").motion
     steps = np.asarray(motion.share)[: int(motion.count) + 1]
     assert int(motion.status) == wholearm_jax.Status.LEFT_FORMATION
     assert 0.5 < steps[-1] < 1.0
 
     data = scene_file.to_dict(scene)
     model = unreduced.Model(data, data["phase"][phase]["contacts"])
-    begin = np.asarray(plan.sample(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
+    begin = np.asarray(sample(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
     assert np.abs(model.geometry(begin, np.zeros(5))[0]).max() < 1e-14
     times, values = np.asarray(torque.times), np.asarray(torque.values)
-    run = model.simulate(begin, data["phase"][phase]["toward"], times, values, steps[-1] * DURATION)
-    assert [which for _, which in run.reversals] == REVERSALS.get((name, phase), [])
+    followed = model.simulate(begin, data["phase"][phase]["toward"], times, values, steps[-1] * DURATION)
+    assert [which for _, which in followed.reversals] == REVERSALS.get((name, phase), [])
 
     shares = [steps] + ([np.linspace(0.0, steps[-1], samples)] if samples else [])
-    for time, _ in run.reversals:
+    for time, _ in followed.reversals:
         late = time / DURATION + (steps[-1] - time / DURATION) * np.linspace(0.05, 0.95, 10)
         shares.append(late if samples else steps[:0])
         assert time / DURATION < steps[-2]  # a step after the reversal is compared in any case
     shares = np.concatenate(shares)
     # The end may lie a rounding beyond the other simulation, and at a reversal forces jump.
     shares = np.minimum(shares, steps[-1] * (1 - 1e-12))
-    for time, _ in run.reversals:
+    for time, _ in followed.reversals:
         shares = shares[np.abs(shares - time / DURATION) > 1e-9]
-    ours = plan.sample(table, torque, start, length, motion, jnp.asarray(shares))
-    z, z_dot, cn = (np.array(column) for column in zip(*(run.at(t) for t in shares * DURATION), strict=True))
+    ours = sample(table, torque, start, length, motion, jnp.asarray(shares))
+    z, z_dot, cn = (np.array(column) for column in zip(*(followed.at(t) for t in shares * DURATION), strict=True))
     assert cn.min() > 0.3  # both see compression throughout, so that relative errors mean something
     errors = np.abs(ours.z - z).max(), np.abs(ours.z_dot - z_dot).max(), np.abs(np.asarray(ours.cn) / cn - 1).max()
     print(f"{name}, phase {phase}: largest errors z %.1e, z_dot %.1e, c_n (relative) %.1e" % errors)
@@ -128,7 +130,7 @@ def test_start_after_waiting(name, phase):
     times = np.concatenate([[0.0], delay + np.asarray(later.times)])
     values = np.concatenate([[held.torque], np.asarray(later.values)])
     torque, start, length = wholearm_jax.torque(times, values), jnp.asarray(0.0), jnp.asarray(times[-1])
-    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-12), "moving").motion
+    motion = run(table, torque, start, length, Integration(tolerance=1e-12), "moving").motion
     assert bool(motion.held[0])
     steps = np.asarray(motion.share)[: int(motion.count) + 1]
     assert np.all(np.diff(steps) >= 0)
@@ -137,7 +139,7 @@ def test_start_after_waiting(name, phase):
 
     data = scene_file.to_dict(scene)
     model = unreduced.Model(data, data["phase"][phase]["contacts"])
-    begin = np.asarray(plan.sample(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
+    begin = np.asarray(sample(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
     signs = np.sign(model.reversing(begin, model.direction(begin, data["phase"][phase]["toward"])))
     first = np.array([np.interp(departure, times, column) for column in values.T])
     # At departure the forward acceleration is zero by the other model too.
@@ -145,12 +147,12 @@ def test_start_after_waiting(name, phase):
     # Moving off from exactly zero acceleration is all rounding: leave that to the first step after it.
     from_there = np.concatenate([[departure + 1e-9], times[times > departure]])
     rows = np.stack([np.interp(from_there, times, column) for column in values.T], axis=1)
-    run = model.simulate(begin, data["phase"][phase]["toward"], from_there, rows, end)
+    followed = model.simulate(begin, data["phase"][phase]["toward"], from_there, rows, end)
     # From above the departure on; the reversal near the heptagon's end has its own test.
     clock = np.linspace(departure + 0.01, departure + 0.95 * (end - departure), 40)
-    z = np.array([run.at(t)[0] for t in clock])
+    z = np.array([followed.at(t)[0] for t in clock])
     assert np.ptp(z[:, 0]) > 0.02
-    ours = plan.sample(table, torque, start, length, motion, jnp.asarray(clock / times[-1]))
+    ours = sample(table, torque, start, length, motion, jnp.asarray(clock / times[-1]))
     error = np.abs(ours.z - z).max()
     print(f"{name}, phase {phase}: departs at {departure:.3f} s, largest error {error:.1e}")
     assert error < 1e-9

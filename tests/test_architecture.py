@@ -6,18 +6,20 @@ from pathlib import Path
 import jax
 
 import wholearm_jax as wa
-from wholearm_jax import plan
+from wholearm_jax.phase import _run, prepare
 
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
-    *("status", "scene", "contacts", "system", "elimination", "newton", "writing", "programs"),
-    *("march", "wire", "reduction"),
-    *("schedule", "motion", "forces", "verdict", "holding", "plan", "gradient", "gradient_check"),
-    *("squeeze", "shooting", "descent", "formations", "optimiser", "baseline"),
+    *("status", "precision", "scene", "contacts", "system", "elimination", "newton", "writing", "programs"),
+    *("march", "start", "places", "wire", "reduction"),
+    *("schedule", "stepping", "landing", "motion", "forces", "verdict", "holding"),
+    *("phase", "result", "sampling", "plan", "gradient", "gradient_check"),
+    *("squeeze", "shooting", "descent", "formations", "guesses", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),
     *("free_bodies", "execution", "perturbation"),
-    *("scene_file", "result_file", "store", "polygon_file", "palette", "report", "drawing", "__init__"),
-    *("arguments", "batch_command", "command"),
+    *("scene_file", "result_file", "store", "polygon_file", "palette", "report"),
+    *("drawing", "execution_drawing", "survey_drawing", "__init__"),
+    *("arguments", "batch_command", "execution_command", "command"),
 )
 
 
@@ -35,9 +37,16 @@ def test_each_module_imports_only_from_those_above_it():
         assert not below, f"{name} imports {below} from below"
 
 
-def test_matplotlib_stays_in_the_drawing_module_and_the_command_line():
+def test_matplotlib_stays_in_the_drawing_modules_and_the_command_line():
     for path in PACKAGE.glob("*.py"):
-        if path.stem not in ("drawing", "command", "batch_command"):
+        if path.stem not in (
+            "drawing",
+            "execution_drawing",
+            "survey_drawing",
+            "batch_command",
+            "execution_command",
+            "command",
+        ):
             assert "matplotlib" not in path.read_text(), path.stem
 
 
@@ -66,6 +75,6 @@ def test_scenes_of_one_size_share_their_programs():
         scene = wa.load(name)
         with jax.log_compiles(False):
             wa.simulate(scene, wa.quasistatic(scene))
-        sizes = (plan.prepare.plain._cached._cache_size(), plan._run.plain._cached._cache_size())
+        sizes = (prepare.plain._cached._cache_size(), _run.plain._cached._cache_size())
         count(sizes)
     assert len(compiled) == 1, f"a later scene compiled again: {compiled}"

@@ -9,11 +9,11 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax import plan
 from wholearm_jax.contacts import normal_rows, slip_rows
-from wholearm_jax.motion import Integration
-from wholearm_jax.plan import start_configuration
+from wholearm_jax.phase import start_configuration
 from wholearm_jax.reduction import change, horner, powers
 from wholearm_jax.scene import body
 from wholearm_jax.scene import heading as wa_heading
+from wholearm_jax.stepping import Integration
 from wholearm_jax.system import system
 
 FLIGHTS = ("flight", "passage")

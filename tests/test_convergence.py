@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.motion import Integration, move
+from wholearm_jax.motion import move
 from wholearm_jax.reduction import blank
 from wholearm_jax.schedule import padded, window
 from wholearm_jax.status import Status
+from wholearm_jax.stepping import Integration
 from wholearm_jax.wire import Resolution
 
 LOOSE = 1e6  # a tolerance that accepts every step: steps are what lies between knots

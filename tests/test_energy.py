@@ -6,10 +6,11 @@ import pytest
 from test_against_unreduced import DURATION, passing
 
 import wholearm_jax
-from wholearm_jax import plan
 from wholearm_jax.contacts import contacts, slip_rows
-from wholearm_jax.motion import Integration
+from wholearm_jax.phase import run
+from wholearm_jax.sampling import sample
 from wholearm_jax.scene import body
+from wholearm_jax.stepping import Integration
 
 NODES = 8  # Gauss-Legendre points a step
 
@@ -23,13 +24,13 @@ def test_balance(name, phase):
     several = contacts(solid, hand, scene.phases[phase].formation)
     table = wholearm_jax.trace(scene)[phase].table
     torque, start, length = passing(table), jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-13, max_steps=512), "moving").motion
+    motion = run(table, torque, start, length, Integration(tolerance=1e-13, max_steps=512), "moving").motion
     ends = np.asarray(motion.share)[: int(motion.count) + 1]
     x, weight = np.polynomial.legendre.leggauss(NODES)
     low, high = ends[:-1, None], ends[1:, None]
     shares = (low + high) / 2 + (high - low) / 2 * x
     weights = ((high - low) / 2 * weight).ravel() * DURATION
-    at = plan.sample(table, torque, start, length, motion, jnp.asarray(shares.ravel()))
+    at = sample(table, torque, start, length, motion, jnp.asarray(shares.ravel()))
     z, z_dot = np.asarray(at.z), np.asarray(at.z_dot)
     slip = np.stack([np.asarray(slip_rows(several, q)) @ rate for q, rate in zip(z, z_dot, strict=True)])
     joint = z_dot[:, 3:]
@@ -42,7 +43,7 @@ def test_balance(name, phase):
     inertia = np.array([solid.mass, solid.mass, solid.inertia, *hand.inertia], float)
 
     def energy(share):
-        last = plan.sample(table, torque, start, length, motion, jnp.asarray([share]))
+        last = sample(table, torque, start, length, motion, jnp.asarray([share]))
         kinetic = (inertia * np.asarray(last.z_dot)[0] ** 2).sum() / 2
         return kinetic - float(solid.mass) * np.asarray(scene.gravity) @ np.asarray(last.z)[0, :2], kinetic
 

@@ -16,8 +16,8 @@ from scipy.stats import binomtest
 
 import wholearm_jax as wa
 from wholearm_jax.contacts import contacts, frames
-from wholearm_jax.drawing import animate, draw_execution, draw_execution_strip
 from wholearm_jax.execution import Ending, Tolerance, clock, drive, execute, start_of
+from wholearm_jax.execution_drawing import animate, draw_execution, draw_execution_strip
 from wholearm_jax.free_bodies import _wedges, free_bodies
 from wholearm_jax.perturbation import Amounts, perturb, start_near, wilson
 from wholearm_jax.scene import body, formation

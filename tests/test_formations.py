@@ -5,7 +5,7 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.formations import leaving, touching, ways
-from wholearm_jax.plan import end_configuration, start_configuration
+from wholearm_jax.phase import end_configuration, start_configuration
 
 
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])

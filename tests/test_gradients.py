@@ -11,10 +11,11 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.gradient import torque_gradient
-from wholearm_jax.motion import Integration
-from wholearm_jax.plan import end_configuration, margin, steps_within
+from wholearm_jax.phase import end_configuration
+from wholearm_jax.plan import margin, steps_within
 from wholearm_jax.scene_file import to_dict
 from wholearm_jax.schedule import Torque
+from wholearm_jax.stepping import Integration
 
 
 def richardson(function, largest):

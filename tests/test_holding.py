@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax import optimiser, plan
+from wholearm_jax import optimiser
 from wholearm_jax.execution import Ending, execute
 from wholearm_jax.holding import statics, watch
+from wholearm_jax.phase import balance_at_start, end_configuration, start_configuration
 from wholearm_jax.result_file import summary
 from wholearm_jax.scene_file import to_dict
 from wholearm_jax.squeeze import hold
@@ -95,7 +96,7 @@ def optimised(slide_hold_flip):
 def test_the_margin_over_time_is_exact(slide_hold_flip):
     """Against many programmes along the way: the least margin lies at a knot, the loss where the balance says."""
     scene, traced = slide_hold_flip
-    balance, _ = plan.balance_at_start(scene, scene.phases[1], traced[1])
+    balance, _ = balance_at_start(scene, scene.phases[1], traced[1])
     best = balance.best().torque
     rng = np.random.default_rng(3)
     losses = 0
@@ -124,7 +125,7 @@ def test_slide_hold_flip(slide_hold_flip, optimised):
     assert optimised.result.margin == min(slide.margin, flip.margin)
     assert optimised.result.hold_margin == pause.margin > 2.0
     assert optimised.reached[1] == pytest.approx(1.0, abs=0.011)
-    np.testing.assert_allclose(plan.start_configuration(traced[2].table), plan.end_configuration(traced[0]), atol=1e-9)
+    np.testing.assert_allclose(start_configuration(traced[2].table), end_configuration(traced[0]), atol=1e-9)
     (held,) = pause.holds
     assert (held.start, held.end, held.lost) == (1.0, 1.5, None)
     course = wa.trajectory(optimised.result)[1]
@@ -141,7 +142,7 @@ def test_executed_on_free_bodies(optimised):
     done = execute(optimised.result)
     assert done.ending is Ending.OK
     at_rest = (done.course.time > 1.0) & (done.course.time < 1.5)
-    end = plan.end_configuration(optimised.result.phases[0].traced)
+    end = end_configuration(optimised.result.phases[0].traced)
     off = done.course.z[at_rest, :2] - np.asarray(end)[:2]
     assert np.hypot(*off.T).max() < 5e-4
 
@@ -171,7 +172,7 @@ def test_a_hold_that_the_contacts_cannot_bear_is_named(slide_hold_flip, optimise
 def test_an_object_that_departs_is_not_held(slide_hold_flip, optimised):
     """Backward along the wire as it was traced says `reversed`, forward `not_reached`, each when it departs."""
     scene, traced = slide_hold_flip
-    _, departure = plan.balance_at_start(scene, scene.phases[1], traced[1])
+    _, departure = balance_at_start(scene, scene.phases[1], traced[1])
     base = np.asarray(optimised.torque.values)[31]
     seen = {}
     for row, status in ((departure.ahead, "not_reached"), (departure.behind, "reversed")):
@@ -195,7 +196,7 @@ def test_the_way_to_a_hold_keeps_the_rate_limit(slide_hold_flip):
     rate = np.abs(np.diff(schedule.values, axis=0)) / np.diff(schedule.times)[:, None]
     np.testing.assert_array_equal(schedule.values[0], before)
     assert rate.max() == pytest.approx(2.0, rel=1e-9)
-    balance, departure = plan.balance_at_start(scene, scene.phases[1], traced[1])
+    balance, departure = balance_at_start(scene, scene.phases[1], traced[1])
     np.testing.assert_allclose(schedule.values[-1], balance.steadiest(departure).torque, atol=1e-12)
     margins = [balance.support(torque).margin for torque in np.asarray(schedule.values)]
     assert min(margins) >= min(margins[0], margins[-1]) - 1e-9

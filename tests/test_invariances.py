@@ -8,7 +8,8 @@ import pytest
 from test_against_unreduced import passing
 
 import wholearm_jax
-from wholearm_jax import plan, scene_file
+from wholearm_jax import scene_file
+from wholearm_jax.sampling import sample
 
 NAMES = ("heptagon", "hexagon")
 EXACT = 1e-10
@@ -24,7 +25,7 @@ def outcome(data, torque):
         motion = phase.outcome.motion
         last = motion.share[motion.count][None]
         start, length = jnp.asarray(phase.start), jnp.asarray(phase.duration)
-        path = plan.sample(phase.traced.table, torque, start, length, motion, last * (1 - 1e-13))
+        path = sample(phase.traced.table, torque, start, length, motion, last * (1 - 1e-13))
         row = {
             "status": phase.status,
             "contact": phase.contacts.index(phase.margin_contact),

@@ -9,7 +9,8 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from wholearm_jax.plan import end_configuration, simulate
+from wholearm_jax.phase import end_configuration
+from wholearm_jax.plan import simulate
 from wholearm_jax.result_file import read_torque, summary, write_summary, write_torque, write_trajectory
 from wholearm_jax.scene_file import SceneError, load, parse, to_dict
 from wholearm_jax.schedule import torque

@@ -12,11 +12,14 @@ from test_against_unreduced import passing
 from test_gradients import nearest_difference
 
 import wholearm_jax
-from wholearm_jax import plan, scene_file, squeeze
+from wholearm_jax import scene_file, squeeze
 from wholearm_jax.contacts import constraint_curvature, constraint_rows, constraints, contacts, placed, slip_rows
-from wholearm_jax.motion import Integration
+from wholearm_jax.phase import run
+from wholearm_jax.reduction import horner, powers
+from wholearm_jax.sampling import sample
 from wholearm_jax.scene import body, formation
 from wholearm_jax.schedule import Torque
+from wholearm_jax.stepping import Integration
 
 DURATION = 1.0
 
@@ -112,19 +115,19 @@ def test_against_unreduced(rolling):
     """Motion and all forces of a passage against the independent simulation of five coordinates."""
     data, traced, torque = rolling
     table, start, length = traced.table, jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-13), "moving").motion
+    motion = run(table, torque, start, length, Integration(tolerance=1e-13), "moving").motion
     assert int(motion.status) == wholearm_jax.Status.LEFT_FORMATION
     end = float(motion.share[motion.count]) * (1 - 1e-12)
     steps = np.asarray(motion.share)[: int(motion.count)]
 
     names = data["phase"][0]["contacts"]
     model = unreduced.Model(data, names)
-    begin = np.asarray(plan.sample(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
+    begin = np.asarray(sample(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
     times, values = np.asarray(torque.times), np.asarray(torque.values)
-    run = model.simulate(begin, data["phase"][0]["toward"], times, values, end * DURATION)
+    followed = model.simulate(begin, data["phase"][0]["toward"], times, values, end * DURATION)
     shares = np.concatenate([steps, np.linspace(0.0, end, 150)])
-    ours = plan.sample(table, torque, start, length, motion, jnp.asarray(shares))
-    z, z_dot, forces = (np.array(column) for column in zip(*(run.at(t) for t in shares * DURATION), strict=True))
+    ours = sample(table, torque, start, length, motion, jnp.asarray(shares))
+    z, z_dot, forces = (np.array(column) for column in zip(*(followed.at(t) for t in shares * DURATION), strict=True))
     count, rolls = len(names), model.rolls
     cn, ct = np.asarray(ours.cn), np.asarray(ours.ct)
     size = np.abs(forces).max()
@@ -150,12 +153,12 @@ def test_energy(rolling):
     data, traced, torque = rolling
     scene, table = wholearm_jax.parse(data), traced.table
     start, length = jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = plan.run(table, torque, start, length, Integration(tolerance=1e-13, max_steps=512), "moving").motion
+    motion = run(table, torque, start, length, Integration(tolerance=1e-13, max_steps=512), "moving").motion
     ends = np.asarray(motion.share)[: int(motion.count) + 1]
     x, weight = np.polynomial.legendre.leggauss(8)
     low, high = ends[:-1, None], ends[1:, None]
     shares, weights = ((low + high) / 2 + (high - low) / 2 * x).ravel(), ((high - low) / 2 * weight).ravel() * DURATION
-    at = plan.sample(table, torque, start, length, motion, jnp.asarray(shares))
+    at = sample(table, torque, start, length, motion, jnp.asarray(shares))
     solid, hand, count = body(scene.object), scene.hand, len(data["phase"][0]["contacts"])
     names = [name.removesuffix(" rolling") for name in data["phase"][0]["contacts"]]
     several = contacts(solid, hand, formation(names))
@@ -166,7 +169,7 @@ def test_energy(rolling):
     inertia = np.array([solid.mass, solid.mass, solid.inertia, *hand.inertia], float)
 
     def energy(share):
-        last = plan.sample(table, torque, start, length, motion, jnp.asarray([share]))
+        last = sample(table, torque, start, length, motion, jnp.asarray([share]))
         kinetic = (inertia * np.asarray(last.z_dot)[0] ** 2).sum() / 2
         return kinetic - float(solid.mass) * np.asarray(scene.gravity) @ np.asarray(last.z)[0, :2]
 
@@ -194,9 +197,9 @@ def test_pivot_by_hand():
     _, force = (np.asarray(a) for a in jax.vmap(squeeze.coefficients, (None, 0))(table, jnp.asarray(s)))
     torque, v = np.array([0.11, -0.34]), 0.7
     for where, f_rows in zip(s, force, strict=True):
-        panel, xi = plan.powers(table, jnp.asarray(0), jnp.asarray(where))
-        z = np.asarray(plan.horner(table.configuration[panel], xi))
-        x = np.asarray(plan.horner(table.velocity[panel], xi))
+        panel, xi = powers(table, jnp.asarray(0), jnp.asarray(where))
+        z = np.asarray(horner(table.configuration[panel], xi))
+        x = np.asarray(horner(table.velocity[panel], xi))
         spin = x[2] * v
         rates, bends, arms, pushes = [], [], [], []
         turn = np.array([[np.cos(z[2]), -np.sin(z[2])], [np.sin(z[2]), np.cos(z[2])]])

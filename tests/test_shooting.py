@@ -8,10 +8,11 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.descent import Limits, moved
-from wholearm_jax.motion import Integration, move
+from wholearm_jax.motion import move
 from wholearm_jax.plan import trace
 from wholearm_jax.schedule import window
 from wholearm_jax.shooting import Variables, local, shoot
+from wholearm_jax.stepping import Integration
 
 HOW = Integration()
 

@@ -14,12 +14,14 @@ import wholearm_jax as wa
 from wholearm_jax.contacts import gaps
 from wholearm_jax.forces import REFINED, SAMPLES, arc, score
 from wholearm_jax.march import Watched, crossings
-from wholearm_jax.motion import Integration, move
-from wholearm_jax.plan import end_configuration, outcomes, prepare
+from wholearm_jax.motion import move
+from wholearm_jax.phase import end_configuration, prepare
+from wholearm_jax.plan import outcomes
 from wholearm_jax.reduction import balance, blank, horner, powers
 from wholearm_jax.scene import body
 from wholearm_jax.schedule import window
 from wholearm_jax.squeeze import hold, holds
+from wholearm_jax.stepping import Integration
 from wholearm_jax.system import system
 from wholearm_jax.wire import Resolution
 

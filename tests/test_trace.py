@@ -11,7 +11,7 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax.contacts import gaps, normal_rows, slip_rows
 from wholearm_jax.newton import newton
-from wholearm_jax.plan import end_configuration, ending
+from wholearm_jax.phase import end_configuration, ending
 from wholearm_jax.reduction import horner, powers
 from wholearm_jax.scene import body
 from wholearm_jax.scene_file import to_dict

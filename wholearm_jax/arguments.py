@@ -1,8 +1,12 @@
-"""What the commands have in common: their arguments, and what is said of those that cannot be used."""
+"""What the commands have in common: their arguments, what these stand for, and what is said of unusable ones.
+
+What takes long to import is imported where it is used: a command that needs none of it starts at once.
+"""
 
 from pathlib import Path
 from typing import Annotated
 
+import jax
 import typer
 
 SceneName = Annotated[str, typer.Argument(help="A bundled scene's name, or the path of a scene file.")]
@@ -11,3 +15,105 @@ TorqueFile = Annotated[Path, typer.Option("--torque", help="Torque schedule, CSV
 
 class BadInput(Exception):
     """What the user gave cannot be used; the message is one line."""
+
+
+def scene_of(name: str, changes: list[str] | None):
+    """Load a scene and apply `--set`."""
+    from wholearm_jax.scene_file import load
+
+    scene = load(name)
+    for change in changes or ():
+        scene = _changed(scene, change)
+    return scene
+
+
+def _changed(scene, change: str):
+    import equinox as eqx
+
+    from wholearm_jax.scene import replace_duration
+
+    key, _, value = change.partition("=")
+    phase, _, field = key.rpartition(".")
+    names = [p.name for p in scene.phases]
+    row = phase_number(scene, phase)
+    if field != "duration" or row is None:
+        raise BadInput(f"--set {change}: write PHASE.duration=SECONDS; phases: {', '.join(names)}")
+    try:
+        seconds = float(value)
+    except ValueError:
+        seconds = float("nan")
+    if not 0 < seconds < float("inf"):
+        raise BadInput(f"--set {change}: a duration is a positive number of seconds")
+    phases = tuple(replace_duration(p, seconds) if k == row else p for k, p in enumerate(scene.phases))
+    return eqx.tree_at(lambda s: s.phases, scene, phases)
+
+
+def phase_number(scene, phase: str) -> int | None:
+    """The number of a phase given by name or number."""
+    names = [p.name for p in scene.phases]
+    numbered = phase.isdecimal() and int(phase) < len(names)
+    return names.index(phase) if phase in names else int(phase) if numbered else None
+
+
+def traced_or_refused(name: str, scene):
+    """Trace a plan; refuse it, naming the contact, where a formation's contacts cannot all touch where it begins."""
+    import numpy as np
+
+    from wholearm_jax.contacts import constraints, frames, placed
+    from wholearm_jax.phase import destination
+    from wholearm_jax.plan import trace
+    from wholearm_jax.scene import body
+    from wholearm_jax.system import system
+
+    @jax.jit
+    def apart(formation, z, rough):
+        mechanics = system(body(scene.object), scene.hand, scene.gravity, formation)
+        held = placed(mechanics.contacts, rough / mechanics.configuration_unit)
+        at, missed = frames(held, z), jax.numpy.abs(constraints(held, z))
+        beyond = jax.numpy.maximum(0.0, jax.numpy.maximum(held.lower - at.along, at.along - held.upper))
+        gap = jax.numpy.where(held.tangential, missed, jax.numpy.hypot(at.gap, beyond))
+        return gap, mechanics.length, mechanics.configuration_unit
+
+    traced = trace(scene)
+    for k, (phase, at) in enumerate(zip(scene.phases, traced, strict=True)):
+        if int(at.table.status) == 0:
+            continue
+        rough = destination(scene.phases[k - 1], traced[k - 1]) if k > 0 else scene.start
+        gap, length, unit = apart(phase.formation, at.wire.start, rough)
+        where = "with the others, from this start"
+        if k > 0 and not np.any(gap > 1e-6):
+            gap, _, _ = apart(phase.formation, rough / unit, rough)
+            where = f"where phase '{scene.phases[k - 1].name}' ends"
+        if not np.all(gap <= 1e-6):
+            worst = int(np.argmax(gap))
+            which = phase.formation.names[phase.formation.contact_of_slot[worst]]
+            key, size = f"phase[{k}].contacts", float(gap[worst] * length)
+            if phase.formation.tangential[worst]:
+                raise BadInput(f"{name}: {key}: {which} cannot stay in its place {where}: it is off by {size:.3g} m")
+            raise BadInput(f"{name}: {key}: {which} cannot touch {where}: a gap of {size:.3g} m stays open")
+        break  # what follows a wire that cannot be followed has no start
+    return traced
+
+
+def predicted(scene, schedule, torque: Path, tolerance: float, traced):
+    """Simulate a plan under a schedule; refuse one from the file `torque` that is too short."""
+    from wholearm_jax.plan import simulate as follow
+
+    try:
+        return follow(scene, schedule, tolerance=tolerance, traced=traced)
+    except ValueError as error:
+        raise BadInput(f"{torque}: {error}") from None
+
+
+def made_folder(out: Path | None) -> Path | None:
+    """Make the output folder now, so that a long computation is not lost to a folder that cannot be written."""
+    if out is None:
+        return None
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".wholearm"
+        probe.write_text("")
+        probe.unlink()
+    except OSError as error:
+        raise BadInput(f"--out {out}: cannot be written: {error.strerror}") from None
+    return out

@@ -17,13 +17,15 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from wholearm_jax.motion import Integration
-from wholearm_jax.optimiser import replace_duration
-from wholearm_jax.plan import Result, Traced, require_motion, require_x64, run, simulate, trace
-from wholearm_jax.scene import Phase, Scene
+from wholearm_jax.phase import Traced, run
+from wholearm_jax.plan import require_motion, simulate, trace
+from wholearm_jax.precision import require_x64
+from wholearm_jax.result import Result
+from wholearm_jax.scene import Phase, Scene, replace_duration
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.squeeze import coefficients, hold
 from wholearm_jax.status import Status
+from wholearm_jax.stepping import Integration
 
 STEP = 1.1
 HOLDS = tuple(STEP**-k for k in range(26, 0, -1))  # shares of the torque limits within which a series may begin

@@ -18,25 +18,14 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.motion import Integration
-from wholearm_jax.plan import (
-    Outcome,
-    Result,
-    Traced,
-    end_configuration,
-    final_configuration,
-    joined,
-    prepare,
-    require_covered,
-    require_motion,
-    require_x64,
-    run,
-    simulate,
-    steps_within,
-)
+from wholearm_jax.phase import Outcome, Traced, end_configuration, final_configuration, prepare, run
+from wholearm_jax.plan import joined, require_covered, require_motion, simulate, steps_within
+from wholearm_jax.precision import require_x64
+from wholearm_jax.result import Result
 from wholearm_jax.scene import Formation, Heading, Scene, body
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.status import Status
+from wholearm_jax.stepping import Integration
 from wholearm_jax.variation import Ensemble, stack
 from wholearm_jax.verdict import ARRIVAL, GOALS
 from wholearm_jax.wire import Resolution
@@ -78,6 +67,11 @@ FULL = Level(Resolution(), Integration(), 1e-9)
 class Source(Protocol):
     """What scenes come from: an `Ensemble`, or scenes that are given (`Given`)."""
 
+    @property
+    def nominal(self) -> Scene:
+        """Its scene, or scenes, as far as all are alike in: phases, their names and how they arrive."""
+        ...
+
     def draw(self, number: Int[Array, ""]) -> Scene:
         """Scene number `number`."""
         ...
@@ -87,6 +81,11 @@ class Given(eqx.Module):
     """Scenes stacked along a leading axis (`variation.stack`)."""
 
     scenes: Scene
+
+    @property
+    def nominal(self) -> Scene:
+        """The stacked scenes."""
+        return self.scenes
 
     @property
     def count(self) -> int:
@@ -165,9 +164,8 @@ def check_chunks(
 ) -> Iterator[tuple[int, Checked]]:
     """`check` one chunk after the other: numbers of chunks (those `wanted`, by default all) with their results."""
     require_x64()
-    nominal = source.scene if isinstance(source, Ensemble) else source.scenes
-    require_motion(nominal)  # holds need linear programmes, which compiled checks leave out
-    require_covered(nominal, torque)
+    require_motion(source.nominal)  # holds need linear programmes, which compiled checks leave out
+    require_covered(source.nominal, torque)
     mesh = Mesh(np.asarray(devices or jax.local_devices()), ("scenes",))
     levels = (QUICK, FULL) if tolerance >= EXACT else (FULL,)
     for number in range(-(-count // chunk)) if wanted is None else wanted:
@@ -177,7 +175,7 @@ def check_chunks(
 
 def _check_rows(source, rows, torque: Torque, arrival, levels, mesh) -> Checked:
     """Check some scenes, level by level; those of the last that are not good, alone."""
-    schedule, steps = padded(torque), _steps_within(source, torque)
+    schedule, steps = padded(torque), steps_within(source.nominal, torque)
     found, left = None, np.arange(len(rows))
     for level in levels:
         level = level._replace(how=replace(level.how, steps=steps))
@@ -196,15 +194,6 @@ def _check_rows(source, rows, torque: Torque, arrival, levels, mesh) -> Checked:
         for column, new in zip(found, alone, strict=True):
             column[row] = new
     return found
-
-
-def _steps_within(source, torque: Torque) -> bool:
-    """Whether the schedule steps within a phase of some scene."""
-    if isinstance(source, Ensemble):
-        return steps_within(source.scene, torque)  # ensembles have one scene's durations
-    if any(np.ptp(phase.duration) > 0 for phase in source.scenes.phases):
-        return bool(np.any(np.diff(torque.times) == 0))
-    return steps_within(source.draw(jnp.asarray(0)), torque)
 
 
 def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):

@@ -251,8 +251,9 @@ def _report(store, scene, source, out: Path):
     import jax
     import numpy as np
 
-    from wholearm_jax.drawing import draw_survey, save_figure
+    from wholearm_jax.drawing import save_figure
     from wholearm_jax.survey import influences, most_influential, survey
+    from wholearm_jax.survey_drawing import draw_survey
     from wholearm_jax.variation import Ensemble
     from wholearm_jax.writing import write_whole
 

@@ -13,8 +13,18 @@ from typing import Annotated
 import jax
 import typer
 
-from wholearm_jax.arguments import BadInput, SceneName, TorqueFile
+from wholearm_jax.arguments import (
+    BadInput,
+    SceneName,
+    TorqueFile,
+    made_folder,
+    phase_number,
+    predicted,
+    scene_of,
+    traced_or_refused,
+)
 from wholearm_jax.batch_command import ARRIVAL, check, ensemble, optimise_robustly
+from wholearm_jax.execution_command import execute
 from wholearm_jax.programs import keep
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -100,8 +110,8 @@ def optimise(
     """Find the torques with the largest compressive margin, and check them by simulation."""
     if report and out is None:
         raise BadInput("--report: needs a folder to write to: add --out DIR")
-    loaded = _scene(scene, set_)
-    folder = _folder(out)
+    loaded = scene_of(scene, set_)
+    folder = made_folder(out)
     if robust:
         if rate_limit is not None:
             raise BadInput("--robust: knows no --rate-limit")
@@ -115,7 +125,7 @@ def optimise(
 
     begun = time.perf_counter()
     compile_ahead(loaded, knots=knots)
-    traced = _traced(scene, loaded)
+    traced = traced_or_refused(scene, loaded)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bars = [progress.add_task(p.name, total=steps, state="waiting") for p in loaded.phases]
@@ -151,14 +161,14 @@ def simulate(
     ] = False,
 ) -> None:
     """Simulate a plan under a given torque schedule."""
-    loaded = _scene(scene, set_)
+    loaded = scene_of(scene, set_)
     from wholearm_jax.optimiser import bounds
     from wholearm_jax.result_file import read_torque
 
     schedule = read_torque(torque)
-    folder = _folder(out)
-    traced = _traced(scene, loaded)
-    result = _predicted(loaded, schedule, torque, tolerance, traced)
+    folder = made_folder(out)
+    traced = traced_or_refused(scene, loaded)
+    result = predicted(loaded, schedule, torque, tolerance, traced)
     for phase in result.phases:
         print(phase.message)
         for held in phase.holds:
@@ -199,19 +209,19 @@ def formations(
     ] = None,
 ) -> None:
     """List the formations of four contacts that hold at a configuration, and where their wires lead."""
-    loaded = _scene(scene, None)
-    folder = _folder(out)
+    loaded = scene_of(scene, None)
+    folder = made_folder(out)
     from rich.console import Console
     from rich.table import Table
 
     from wholearm_jax.formations import leaving, touching, ways
-    from wholearm_jax.plan import destination, start_configuration
+    from wholearm_jax.phase import destination, start_configuration
 
-    traced = _traced(scene, loaded)
+    traced = traced_or_refused(scene, loaded)
     if after is None:
         z, z_dot = start_configuration(traced[0].table), None
     else:
-        row = _phase_number(loaded, after)
+        row = phase_number(loaded, after)
         if row is None:
             names = ", ".join(p.name for p in loaded.phases)
             raise BadInput(f"--after {after}: no such phase; phases: {names}")
@@ -235,11 +245,11 @@ def formations(
 @app.command()
 def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
     """The paper's search for torques by steps of 10 %."""
-    loaded = _scene(scene, None)
-    folder = _folder(out)
+    loaded = scene_of(scene, None)
+    folder = made_folder(out)
     from wholearm_jax.baseline import search as look
 
-    _traced(scene, loaded)
+    traced_or_refused(scene, loaded)
     try:
         found = look(loaded)
     except ValueError as error:
@@ -264,171 +274,7 @@ def report(
     print(path)
 
 
-@app.command()
-def execute(
-    scene: SceneName,
-    torque: TorqueFile,
-    out: Annotated[Path | None, typer.Option(help="Folder for execution.json, .csv, figures and model.xml.")] = None,
-    timestep: Annotated[float, typer.Option(min=1e-6, max=1e-2, help="Time step [s].")] = 2e-4,
-    position: Annotated[float, typer.Option(min=0.0, help="Success: this near the predicted end [m].")] = 5e-4,
-    angle: Annotated[float, typer.Option(min=0.0, help="Success: this near the predicted angle [rad].")] = 0.01,
-    video: Annotated[bool, typer.Option("--video", help="Also execution.gif and a strip of its frames.")] = False,
-    perturb: Annotated[int, typer.Option(min=0, help="Executions of a perturbed object.")] = 0,
-    seed: Annotated[int, typer.Option(min=0, help="Of the perturbations.")] = 0,
-    friction: Annotated[str, typer.Option(help="Perturbation of friction coefficients, e.g. 10%.")] = "10%",
-    mass: Annotated[str, typer.Option(help="Perturbation of the mass, e.g. 5%.")] = "5%",
-    geometry: Annotated[float, typer.Option(min=0.0, help="Perturbation of the vertices [m].")] = 5e-4,
-    start: Annotated[float, typer.Option(min=0.0, help="Perturbation of the start [m].")] = 5e-4,
-) -> None:
-    """Execute a torque schedule open loop on free bodies with soft contacts, in MuJoCo."""
-    if video and out is None:
-        raise BadInput("--video: needs a folder to write to: add --out DIR")
-    shares = _share("--friction", friction), _share("--mass", mass)
-    loaded = _scene(scene, None)
-    try:
-        from wholearm_jax.execution import Ending, Tolerance
-        from wholearm_jax.execution import execute as drive
-        from wholearm_jax.perturbation import Amounts
-        from wholearm_jax.perturbation import perturb as drive_perturbed
-    except ModuleNotFoundError as error:
-        if error.name != "mujoco":
-            raise
-        raise BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
-    from wholearm_jax.result_file import read_torque
-
-    schedule = read_torque(torque)
-    folder = _folder(out)
-    prediction = _predicted(loaded, schedule, torque, 1e-10, _traced(scene, loaded))
-    within = Tolerance(position, angle)
-    print(f"predicted: {prediction.message}")
-    try:
-        done = drive(prediction, timestep=timestep, tolerance=within)
-    except ValueError:
-        sys.exit(1)  # no wire, no end to arrive at; the line above says why
-    for contact, made, expected, executed in done.events:
-        times = " predicted, ".join("never" if t is None else f"{t:.4f} s" for t in (expected, executed))
-        print(f"{contact} {'made' if made else 'opened'}: {times} executed")
-    many = None
-    if perturb:
-        amounts = Amounts(*shares, geometry, start)
-        many = drive_perturbed(prediction, perturb, amounts, seed=seed, timestep=timestep, tolerance=within)
-        print(many.message)
-    if folder is not None:
-        _write_execution(done, many, torque, folder, video)
-    print(f"executed: {done.message}" + (f" -> {folder}" if folder else ""))
-    sys.exit(0 if done.ending is Ending.OK else 1)
-
-
-def _share(option: str, text: str) -> float:
-    """`10%` or `0.1` -> 0.1."""
-    try:
-        share = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
-    except ValueError:
-        share = -1.0
-    if not 0 <= share < 1:
-        raise BadInput(f"{option} {text}: write a share between 0 and 1, e.g. 10% or 0.1")
-    return share
-
-
-def _predicted(scene, schedule, torque: Path, tolerance: float, traced):
-    """Simulate a plan under a schedule; refuse one from the file `torque` that is too short."""
-    from wholearm_jax.plan import simulate as follow
-
-    try:
-        return follow(scene, schedule, tolerance=tolerance, traced=traced)
-    except ValueError as error:
-        raise BadInput(f"{torque}: {error}") from None
-
-
-def _scene(name: str, changes: list[str] | None):
-    """Load a scene and apply `--set`."""
-    from wholearm_jax.scene_file import load
-
-    scene = load(name)
-    for change in changes or ():
-        scene = _changed(scene, change)
-    return scene
-
-
-def _traced(name: str, scene):
-    """Trace a plan; refuse it, naming the contact, where a formation's contacts cannot all touch where it begins."""
-    import numpy as np
-
-    from wholearm_jax.contacts import constraints, frames, placed
-    from wholearm_jax.plan import destination, trace
-    from wholearm_jax.scene import body
-    from wholearm_jax.system import system
-
-    @jax.jit
-    def apart(formation, z, rough):
-        mechanics = system(body(scene.object), scene.hand, scene.gravity, formation)
-        held = placed(mechanics.contacts, rough / mechanics.configuration_unit)
-        at, missed = frames(held, z), jax.numpy.abs(constraints(held, z))
-        beyond = jax.numpy.maximum(0.0, jax.numpy.maximum(held.lower - at.along, at.along - held.upper))
-        gap = jax.numpy.where(held.tangential, missed, jax.numpy.hypot(at.gap, beyond))
-        return gap, mechanics.length, mechanics.configuration_unit
-
-    traced = trace(scene)
-    for k, (phase, at) in enumerate(zip(scene.phases, traced, strict=True)):
-        if int(at.table.status) == 0:
-            continue
-        rough = destination(scene.phases[k - 1], traced[k - 1]) if k > 0 else scene.start
-        gap, length, unit = apart(phase.formation, at.wire.start, rough)
-        where = "with the others, from this start"
-        if k > 0 and not np.any(gap > 1e-6):
-            gap, _, _ = apart(phase.formation, rough / unit, rough)
-            where = f"where phase '{scene.phases[k - 1].name}' ends"
-        if not np.all(gap <= 1e-6):
-            worst = int(np.argmax(gap))
-            which = phase.formation.names[phase.formation.contact_of_slot[worst]]
-            key, size = f"phase[{k}].contacts", float(gap[worst] * length)
-            if phase.formation.tangential[worst]:
-                raise BadInput(f"{name}: {key}: {which} cannot stay in its place {where}: it is off by {size:.3g} m")
-            raise BadInput(f"{name}: {key}: {which} cannot touch {where}: a gap of {size:.3g} m stays open")
-        break  # what follows a wire that cannot be followed has no start
-    return traced
-
-
-def _changed(scene, change: str):
-    import equinox as eqx
-
-    from wholearm_jax.optimiser import replace_duration
-
-    key, _, value = change.partition("=")
-    phase, _, field = key.rpartition(".")
-    names = [p.name for p in scene.phases]
-    row = _phase_number(scene, phase)
-    if field != "duration" or row is None:
-        raise BadInput(f"--set {change}: write PHASE.duration=SECONDS; phases: {', '.join(names)}")
-    try:
-        seconds = float(value)
-    except ValueError:
-        seconds = float("nan")
-    if not 0 < seconds < float("inf"):
-        raise BadInput(f"--set {change}: a duration is a positive number of seconds")
-    phases = tuple(replace_duration(p, seconds) if k == row else p for k, p in enumerate(scene.phases))
-    return eqx.tree_at(lambda s: s.phases, scene, phases)
-
-
-def _phase_number(scene, phase: str) -> int | None:
-    """The number of a phase given by name or number."""
-    names = [p.name for p in scene.phases]
-    numbered = phase.isdecimal() and int(phase) < len(names)
-    return names.index(phase) if phase in names else int(phase) if numbered else None
-
-
-def _folder(out: Path | None) -> Path | None:
-    """Make the output folder now, so that a long computation is not lost to a folder that cannot be written."""
-    if out is None:
-        return None
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".wholearm"
-        probe.write_text("")
-        probe.unlink()
-    except OSError as error:
-        raise BadInput(f"--out {out}: cannot be written: {error.strerror}") from None
-    return out
+app.command()(execute)
 
 
 def _finish(result, folder: Path | None, samples: int, report: bool = False, **more) -> None:
@@ -456,35 +302,9 @@ def _write_report(folder: Path, path: Path) -> None:
     write_whole(path, page(folder))
 
 
-def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> None:
-    """Write an execution's files."""
-    from wholearm_jax.result_file import execution_summary, write_execution, write_summary
-    from wholearm_jax.writing import write_whole
-
-    try:
-        write_summary(execution_summary(done, many, torque=str(torque)), folder / "execution.json")
-        write_execution(done, folder / "execution.csv")
-        write_whole(folder / "model.xml", done.model_xml)
-        _draw_execution(done, folder, video)
-    except OSError as error:
-        raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
-
-
-def _draw_execution(done, folder: Path, video: bool) -> None:
-    import matplotlib.pyplot as plt
-
-    from wholearm_jax.drawing import animate, draw_execution, draw_execution_strip, save_figure
-
-    save_figure(lambda: draw_execution(done), folder, "execution")
-    if video:
-        save_figure(lambda: draw_execution_strip(done), folder, "frames")
-        animate(done).save(folder / "execution.gif", writer="pillow")  # which needs no further program
-        plt.close("all")
-
-
 def _draw(result, folder: Path) -> None:
     from wholearm_jax.drawing import draw_result, draw_strip, save_figure
-    from wholearm_jax.plan import trajectory
+    from wholearm_jax.sampling import trajectory
 
     figures = {"plan": draw_strip, "result": draw_result} if trajectory(result) else {}  # no motion, nothing to draw
     for name, draw in figures.items():

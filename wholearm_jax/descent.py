@@ -28,11 +28,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.forces import smooth_margin, spare
-from wholearm_jax.motion import Integration
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Table, change, horner, powers
 from wholearm_jax.shooting import PARTS, ROWS, SAMPLES, STEPS, Variables, local, shoot
 from wholearm_jax.squeeze import coefficients
+from wholearm_jax.stepping import Integration
 
 HOTTEST, COLDEST = 0.1, 1e-4  # temperatures, as shares of the bound
 NEAR = 0.95  # share of the way to a limit that a step may go

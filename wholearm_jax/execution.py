@@ -22,7 +22,9 @@ from jaxtyping import Bool, Float
 
 from wholearm_jax.contacts import contacts, frames
 from wholearm_jax.free_bodies import FreeBodies, Softness, free_bodies
-from wholearm_jax.plan import Result, destination, trajectory
+from wholearm_jax.phase import destination
+from wholearm_jax.result import Result
+from wholearm_jax.sampling import trajectory
 from wholearm_jax.scene import Body, Formation, Hand, Scene, body, formation
 from wholearm_jax.schedule import Torque
 from wholearm_jax.status import Status

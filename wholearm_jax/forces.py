@@ -20,9 +20,11 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.motion import Integration, Motion, acceleration, single_step
+from wholearm_jax.landing import acceleration, single_step
+from wholearm_jax.motion import Motion
 from wholearm_jax.reduction import Table, horner, powers
 from wholearm_jax.schedule import Window, torque_in
+from wholearm_jax.stepping import Integration
 
 SAMPLES = 7  # places in a step at which forces are sampled before the minimum is refined
 MOST_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4

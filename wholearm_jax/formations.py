@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wholearm_jax.contacts import every_contact, frames, normal_rows
-from wholearm_jax.plan import Traced, end_configuration, ending, prepare
+from wholearm_jax.phase import Traced, end_configuration, ending, prepare
 from wholearm_jax.reduction import Table, change, horner, powers
 from wholearm_jax.scene import COORDINATES, Heading, Phase, Scene, body, contact_name, formation
 from wholearm_jax.squeeze import Bound, bound, hold

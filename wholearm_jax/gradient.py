@@ -8,10 +8,12 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-from wholearm_jax.motion import Integration
-from wholearm_jax.plan import Traced, least, outcomes, require_x64, steps_within, trace
+from wholearm_jax.phase import Traced
+from wholearm_jax.plan import least, outcomes, steps_within, trace
+from wholearm_jax.precision import require_x64
 from wholearm_jax.scene import Scene
 from wholearm_jax.schedule import Torque
+from wholearm_jax.stepping import Integration
 
 FORWARD = 16
 

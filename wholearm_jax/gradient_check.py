@@ -16,10 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.motion import Integration
-from wholearm_jax.plan import margin, require_x64
+from wholearm_jax.plan import margin
+from wholearm_jax.precision import require_x64
 from wholearm_jax.scene import Scene
 from wholearm_jax.schedule import Torque
+from wholearm_jax.stepping import Integration
 
 TOLERANCES = (1e-8, 1e-10, 1e-12)
 STEPS = tuple(1e-3 / 5**k for k in range(5))  # largest relative changes of the inputs for differences

@@ -18,17 +18,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.contacts import constraint_rows, constraints, frames, slips
 from wholearm_jax.elimination import inverse, times
+from wholearm_jax.precision import digits
 from wholearm_jax.scene import Heading
 from wholearm_jax.status import Status
 from wholearm_jax.system import System
 
 LONGEST, SHORTEST = 0.06, 2e-3  # march steps, and the step at which an end counts as bracketed
 CHARTS = 8  # directions that a wire may be charted by, one after the other
-
-
-def digits(values, share: float):
-    """What is zero to a share of a precision's digits: 1.6e-10 for five eighths of float64's, 5e-5 of float32's."""
-    return jnp.finfo(values.dtype).eps ** share
 
 
 def tangent(system: System, z: Float[Array, "5"], hint: Float[Array, "5"]) -> Float[Array, "5"]:
@@ -267,11 +263,11 @@ def crossings(system, before: Watched, after: Watched, step, tolerance):
     through = (old >= -tolerance) & (new < -tolerance)
     slope = jnp.where(after.rates > before.rates, after.rates - before.rates, 1.0)
     turns = (before.rates < 0) & (after.rates > 0) & (old > tolerance)
-    low = turns & (old - step * before.rates**2 / (2 * slope) < 0)
-    dips = low & (new > tolerance)
+    sinks = turns & (old - step * before.rates**2 / (2 * slope) < 0)
+    dips = sinks & (new > tolerance)
     line = jnp.clip(old / jnp.where(through, old - new, 1.0), 0.0, 1.0)
-    bend = jnp.sqrt(jnp.where(low, before.rates**2 - 2 * old * slope / step, 0.0))
-    where = jnp.where(through & ~low, line, (-before.rates - bend) / slope)  # what comes back is met on its way down
+    bend = jnp.sqrt(jnp.where(sinks, before.rates**2 - 2 * old * slope / step, 0.0))
+    where = jnp.where(through & ~sinks, line, (-before.rates - bend) / slope)  # what comes back is met on its way down
     low, high = step * before.rates, step * after.rates
     square, cube = 3 * (new - old) - 2 * low - high, low + high - 2 * (new - old)
     for _ in range(2):

@@ -14,6 +14,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
 from wholearm_jax.elimination import inverse, times
+from wholearm_jax.precision import digits
 
 
 class Root(NamedTuple):
@@ -29,7 +30,6 @@ def newton(function: Callable, z: Float[Array, "n"], *parameters, steps: int = 2
 
     A root that was not found shows in `residual`, never as NaN or an exception.
     """
-    eps = jnp.finfo(z.dtype).eps
     fixed = stop_gradient(parameters)
 
     def twice(z):
@@ -43,12 +43,14 @@ def newton(function: Callable, z: Float[Array, "n"], *parameters, steps: int = 2
         move = -times(inverted, value)
         move = jnp.where(jnp.isfinite(move), move, 0.0)
         size = jnp.abs(move).max()
-        move = move * jnp.minimum(1.0, longest / jnp.maximum(size, longest * eps))
+        move = move * jnp.minimum(1.0, longest / jnp.maximum(size, longest * jnp.finfo(z.dtype).eps))
         return z + move, inverted, jnp.abs(value).max(), count + 1, size
 
     def going(state):
         _, _, residual, count, size = state
-        return (count < steps) & (size > eps**0.5625) & (residual > 0)  # what is left is of the square of the step
+        return (
+            (count < steps) & (size > digits(z, 9 / 16)) & (residual > 0)
+        )  # what is left is of the square of the step
 
     far = jnp.asarray(jnp.inf, z.dtype)
     start = (stop_gradient(z), jnp.eye(z.shape[0], dtype=z.dtype), far, jnp.asarray(0), far)

@@ -7,7 +7,6 @@ margin falls, and keeps the best schedule whose honest simulation succeeds.
 """
 
 import functools
-import itertools
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,24 +18,23 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.descent import COLDEST, JOINED, Limits, advance, begin, interior_point, passed_on, projected
-from wholearm_jax.motion import Integration
-from wholearm_jax.plan import Result, Traced, balance_at_start, describe, outcomes, require_x64, run, stays, trace
+from wholearm_jax.descent import COLDEST, JOINED, Limits, advance, begin, interior_point, projected
+from wholearm_jax.guesses import guesses
+from wholearm_jax.phase import Traced, balance_at_start, run
+from wholearm_jax.plan import outcomes, trace
+from wholearm_jax.precision import require_x64
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import blank
-from wholearm_jax.scene import Phase, Scene
+from wholearm_jax.result import Result, describe, stays
+from wholearm_jax.scene import Phase, Scene, replace_duration
 from wholearm_jax.schedule import Torque, padded, rounded
 from wholearm_jax.shooting import Variables
-from wholearm_jax.squeeze import Bound, bound, holds
+from wholearm_jax.squeeze import Bound, bound
 from wholearm_jax.status import Status
+from wholearm_jax.stepping import Integration
 from wholearm_jax.wire import Resolution
 
 TORQUE_SHARE = 0.9  # share of the torque limits that a start may use
-PROFILES = tuple((p, q) for p in (1.0, 2.0, 4.0, 8.0, 16.0) for q in (1.0, 2.0, 4.0, 8.0, 16.0))
-FINE = 8  # places a knot interval at which a starting motion is judged
-EVEN = 0.3  # share of the even motion in every profile, so that the object never quite stops on the way
-SPEEDS = (1.0, 0.4, 2.0)  # speeds at changes of formation to start from [wire lengths a duration]
-OTHERS = ((16.0, 1.0), (1.0, 1.0), (1.0, 16.0))  # further starts: a long dwell first, none, a long dwell last
 GOOD = 0.99  # share of the bound with which no further start is tried
 
 
@@ -92,7 +90,7 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
     def torques(at, phase):
         if phase.arrive == "hold":
             return _steady(scene, phase, at, knots)
-        start = _starts([at], [float(phase.duration)], knots, 1.0)[0]
+        start = guesses([at], [float(phase.duration)], knots, 1.0)[0]
         return _evenly(float(phase.duration), at.table.torque_limit * start.torque[0])
 
     return _in_turn([torques(*pair) for pair in zip(traced, scene.phases, strict=True)])
@@ -255,15 +253,15 @@ def _optimise_group(
         if int(at.table.status) != Status.OK:
             why = f"the wire cannot be followed: {Status(int(at.table.status)).label}"
             return [_evenly(t, blank_values) for t in task.durations], why, []
-    starts = _starts(task.traced, task.durations, task.knots, TORQUE_SHARE)
-    best = starts[0]
+    begins = guesses(task.traced, task.durations, task.knots, TORQUE_SHARE)
+    best = begins[0]
     weakest = int(np.argmin(task.bounds))
     if task.bounds[weakest] <= 0:
         where = 100 * float(task.tops[weakest].share)
         why = f"no torque within limits holds this formation at {where:.0f} % of its wire"
         return _schedules(task, best), why, []
     best_key, reason, history = (False, -np.inf), "", []
-    for number, start in enumerate(starts):
+    for number, start in enumerate(begins):
         if before is not None:
             limit = task.traced[0].table.torque_limit
             start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[0, 0].set(before / limit))
@@ -372,50 +370,6 @@ def _honest(scene: Scene, task: _Task, p: Variables) -> tuple[bool, float]:
     return all(fine), least if np.isfinite(least) else -np.inf
 
 
-def _starts(traced: list[Traced], durations, knots: int, share: float) -> list[Variables]:
-    """Motions with the torques that give them, within a `share` of the limits, by the best squeeze.
-
-    One phase goes from rest to rest: first that of `PROFILES` with the largest margin (the even one unless another
-    gains more than 2 %), then `OTHERS`. Several go through their changes of formation at each of `SPEEDS`.
-    """
-    if len(traced) == 1:
-        motions = [_profile(knots, *powers) for powers in PROFILES]
-        torque, margins = _squeezed(traced[0].table, durations[0], motions, share)
-        best = 0 if margins[0] >= margins.max() - 0.02 * abs(margins.max()) else int(np.argmax(margins))
-        order = [best, *(PROFILES.index(other) for other in OTHERS if PROFILES[best] != other)]
-        return [_variables([torque[k]], [motions[k]], durations) for k in order]
-    tables = [at.table for at in traced]
-    ratios = [float(_passed_on(*pair)) for pair in itertools.pairwise(tables)]
-    found = []
-    for speed in SPEEDS:
-        entry, motions, torques = 0.0, [], []
-        for k, (table, length) in enumerate(zip(tables, durations, strict=True)):
-            leave = 0.0 if k == len(tables) - 1 else speed
-            motions.append(_between(knots, entry, leave))
-            torques.append(_squeezed(table, length, motions[-1:], share)[0][0])
-            if k < len(tables) - 1:
-                entry = ratios[k] * leave * float(table.length) / length
-                entry = float(np.clip(entry * durations[k + 1] / float(tables[k + 1].length), 0.0, 2.9))
-        found.append(_variables(torques, motions, durations))
-    return found
-
-
-def _squeezed(table, time: float, motions, share: float):
-    """Torques at the knots, in units of their limits, and least forces [N] of motions given FINE places an interval."""
-    full = np.asarray(table.torque_limit)
-    tight = eqx.tree_at(lambda t: t.torque_limit, table, jnp.asarray(share * full))
-    length, first = float(table.length), float(table.breaks[0])
-    s, v, a = (np.stack(rows) for rows in zip(*motions, strict=True))
-    held = _holds(tight, first + length * s, length * v / time, length * a / time**2)
-    return np.clip(np.asarray(held.torque)[:, ::FINE] / full, -share, share), np.asarray(held.margin).min(1)
-
-
-def _variables(torques, motions, durations) -> Variables:
-    state = np.stack([np.stack(motion[:2], axis=1)[::FINE] for motion in motions])
-    state[:, 0, 0], state[:, -1, 0], state[-1, -1, 1] = 0.0, 1.0, 0.0
-    return Variables(jnp.asarray(np.stack(torques)), jnp.asarray(state), jnp.asarray(np.log(durations)))
-
-
 def _in_turn(schedules: list[Torque]) -> Torque:
     """Schedules one after the other; a step where one follows another."""
     begins = np.cumsum([0.0, *(float(s.times[-1]) for s in schedules[:-1])])
@@ -423,35 +377,7 @@ def _in_turn(schedules: list[Torque]) -> Torque:
     return Torque(*(jnp.asarray(np.concatenate(rows)) for rows in (times, [s.values for s in schedules])))
 
 
-def _between(knots: int, entry: float, leave: float):
-    """Motion over a unit length and time with given speeds at its ends: a cubic."""
-    u = np.linspace(0.0, 1.0, FINE * (knots - 1) + 1)
-    s = np.polynomial.Polynomial([0.0, entry, 3 - 2 * entry - leave, entry + leave - 2])
-    return s(u), s.deriv(1)(u), s.deriv(2)(u)
-
-
-def _profile(knots: int, p: float, q: float):
-    """Motion over a unit length and time from rest to rest, `EVEN` even and the rest with speed `v ~ u^p (1 - u)^q`."""
-    u = np.linspace(0.0, 1.0, FINE * (knots - 1) + 1)
-    inner = np.clip(u, 1e-12, 1 - 1e-12)
-    v = inner**p * (1 - inner) ** q
-    a = v * (p / inner - q / (1 - inner))
-    s = np.concatenate([[0.0], np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(u))])
-    scale = (1 - EVEN) / s[-1]
-    return (
-        scale * s + EVEN * (3 * u**2 - 2 * u**3),
-        scale * v + EVEN * 6 * (u - u**2),
-        scale * a + EVEN * (6 - 12 * u),
-    )
-
-
-_holds = Program(jax.vmap(holds, (None, 0, 0, 0)))
 _bound = Program(bound)
-
-
-@jax.jit
-def _passed_on(before, after):
-    return passed_on(*(jax.tree.map(lambda a: a[None], table) for table in (before, after)))[0]
 
 
 def _limits(task: _Task, rate_limit, durations, before) -> Limits:
@@ -462,8 +388,3 @@ def _limits(task: _Task, rate_limit, durations, before) -> Limits:
     pinned[0, 0] = before is not None
     unit = np.maximum(task.bounds, 1e-300)
     return Limits(*(jnp.asarray(a) for a in (rate, shortest * _ONE, longest * _ONE, pinned, unit)))
-
-
-def replace_duration(phase, duration):
-    """A phase with another duration."""
-    return eqx.tree_at(lambda p: p.duration, phase, jnp.asarray(duration, float))

@@ -25,8 +25,8 @@ from mujoco import rollout
 from wholearm_jax.contacts import gaps, normal_rows
 from wholearm_jax.execution import Ending, Tolerance, clock, judge, motor_torques, require_wires, start_of, target_of
 from wholearm_jax.free_bodies import Softness, free_bodies
-from wholearm_jax.plan import Result
 from wholearm_jax.proportion import wilson
+from wholearm_jax.result import Result
 from wholearm_jax.scene import Formation, Scene, body
 from wholearm_jax.system import system
 

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.contacts import constraint_curvature, constraint_rows, slip_rows
 from wholearm_jax.elimination import inverse, times
+from wholearm_jax.precision import digits
 from wholearm_jax.status import Status
 from wholearm_jax.system import System, configuration_unit
 from wholearm_jax.wire import Resolution, Wire, chebyshev
@@ -232,7 +233,7 @@ def _tail(values):
     coefficients = jnp.einsum("kn,pn...->pk...", _TO_CHEBYSHEV[values.shape[1]], stop_gradient(values))
     tail = jnp.abs(coefficients[:, -2:]).sum(1).max(0)
     size = jnp.abs(values).max((0, 1))
-    least = jnp.finfo(values.dtype).eps ** (1 / 3) * size.max() + jnp.finfo(values.dtype).tiny
+    least = digits(values, 1 / 3) * size.max() + jnp.finfo(values.dtype).tiny
     return (tail / jnp.maximum(size, least)).max()
 
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wholearm_jax.plan import Result, trajectory
+from wholearm_jax.result import Result
+from wholearm_jax.sampling import trajectory
 from wholearm_jax.scene import COORDINATES
 from wholearm_jax.scene_file import CONSTRAINTS, SceneError, to_dict
 from wholearm_jax.schedule import Torque, torque

@@ -21,11 +21,12 @@ import optax
 from jaxtyping import Array, Bool, Float
 
 from wholearm_jax.forces import smooth_margin
-from wholearm_jax.motion import Integration
 from wholearm_jax.optimiser import optimise
-from wholearm_jax.plan import Traced, outcomes, steps_within, trace
+from wholearm_jax.phase import Traced
+from wholearm_jax.plan import outcomes, steps_within, trace
 from wholearm_jax.schedule import Torque
 from wholearm_jax.status import Status
+from wholearm_jax.stepping import Integration
 from wholearm_jax.variation import Ensemble
 from wholearm_jax.verdict import BRAKING
 from wholearm_jax.wire import Resolution

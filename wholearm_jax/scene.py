@@ -235,3 +235,8 @@ def body(shape: Polygon) -> Body:
         inertia=own if shape.inertia is None else shape.inertia,
         friction=shape.friction,
     )
+
+
+def replace_duration(phase: Phase, duration) -> Phase:
+    """A phase with another duration."""
+    return eqx.tree_at(lambda p: p.duration, phase, jnp.asarray(duration, float))

@@ -25,9 +25,10 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
 from wholearm_jax.forces import MOST_ROLLING, Arcs, arc, linear_slacks, sampled_slacks
-from wholearm_jax.motion import Integration, acceleration, single_step
+from wholearm_jax.landing import acceleration, single_step
 from wholearm_jax.reduction import Table
 from wholearm_jax.schedule import Window
+from wholearm_jax.stepping import Integration
 
 STEPS = 2  # solver steps an interval (and a part of it, where it is cut)
 ROWS = 4 + MOST_ROLLING  # slacks a sample

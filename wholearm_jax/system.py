@@ -75,12 +75,13 @@ def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Format
         torque_limit=hand.torque_limit,
     )
     pairs = every_contact(body.vertices.shape[0])
+    touchable = pairs.feature < body.count
     heavy = jnp.stack([small_body.mass, small_body.mass, small_body.inertia])
     return System(
         contacts=contacts(small_body, small_hand, formation),
         candidates=contacts(small_body, small_hand, pairs),
-        real=pairs.feature < body.count,
-        watched=_watched(pairs, formation, body),
+        real=touchable,
+        watched=touchable & ~_coincident(pairs, formation, body.count),
         inertia=jnp.concatenate([heavy, small_hand.inertia]),
         viscous=small_hand.viscous,
         dry=small_hand.dry,
@@ -100,17 +101,16 @@ def _convex(body: Body) -> Bool[Array, ""]:
     return jnp.all((turn >= 0) | (jnp.arange(turn.shape[0]) >= body.count))
 
 
-def _watched(pairs: Formation, formation: Formation, body: Body) -> Bool[Array, "candidates"]:
-    """Pairs of real features that are not in the formation and do not coincide with one of its contacts."""
+def _coincident(pairs: Formation, formation: Formation, count) -> Bool[Array, "candidates"]:
+    """Pairs that are in the formation or coincide with one of its contacts."""
 
     def same(link, kind, feature):
         return (formation.link == link) & (formation.kind == kind) & (formation.feature == feature)
 
     member = jax.vmap(same)(pairs.link, pairs.kind, pairs.feature).any(1)
     # A tip on an edge whose two ends both lie on that finger has no gap of its own: the edge is flush with the link.
-    count = body.count
     after = jnp.where(pairs.feature + 1 < count, pairs.feature + 1, 0)
     here = jax.vmap(same)(pairs.link, jnp.zeros_like(pairs.kind), pairs.feature).any(1)
     there = jax.vmap(same)(pairs.link, jnp.zeros_like(pairs.kind), after).any(1)
     flush = (pairs.kind == EDGE) & here & there
-    return (pairs.feature < count) & ~member & ~flush
+    return member | flush

@@ -59,6 +59,11 @@ class Ensemble(eqx.Module):
     seed: int = eqx.field(static=True, default=0)
 
     @property
+    def nominal(self) -> Scene:
+        """The scene about which the others are drawn."""
+        return self.scene
+
+    @property
     def parameters(self) -> tuple[str, ...]:
         """The names of the numbers that vary, in the order of `shifts`; rows of vertices that pad are among them."""
         return tuple(name for quantity, _ in self.amounts for name in _names(self.scene, quantity))

@@ -20,13 +20,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from wholearm_jax.contacts import constraint_rows, constraints, frames, placed
-from wholearm_jax.elimination import inverse, solve, times
-from wholearm_jax.march import SHORTEST, correct, digits, march, oriented_tangent, signs_of, speeds_of, tangent
-from wholearm_jax.newton import newton
+from wholearm_jax.contacts import constraint_rows, constraints, placed
+from wholearm_jax.elimination import times
+from wholearm_jax.march import correct, march, signs_of, speeds_of, tangent
+from wholearm_jax.places import coordinate, places_of
+from wholearm_jax.precision import digits
 from wholearm_jax.scene import Heading
+from wholearm_jax.start import dependent, leading, misplaced, oriented, project
 from wholearm_jax.status import Status
 from wholearm_jax.system import System
 
@@ -95,19 +97,19 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     system = eqx.tree_at(lambda s: s.contacts, system, placed(system.contacts, rough))
     fixed, fixed_heading = stop_gradient(system), stop_gradient(heading)
 
-    start, residual = _project(system, rough)
-    first_tangent = _oriented(fixed, stop_gradient(start), fixed_heading)
+    start, residual = project(system, rough)
+    first_tangent = oriented(fixed, stop_gradient(start), fixed_heading)
     marched = march(fixed, fixed_heading, stop_gradient(start), first_tangent, resolution.march)
-    places = _places(system, heading, marched, resolution)
+    places = places_of(system, heading, marched, resolution.pieces)
     wire = _cut(system, fixed, marched, places, start, resolution)
     touching = residual < 100 * jnp.finfo(rough.dtype).eps
-    dependent = ~touching & _dependent(fixed, stop_gradient(rough))
-    direction = jnp.abs(first_tangent[_leading(heading, first_tangent)]) > 1e-6
+    tied = ~touching & dependent(fixed, stop_gradient(rough))
+    direction = jnp.abs(first_tangent[leading(heading, first_tangent)]) > 1e-6
     worst = jnp.select(
         [
-            dependent,
+            tied,
             ~touching,
-            _misplaced(fixed, stop_gradient(start)),
+            misplaced(fixed, stop_gradient(start)),
             ~direction,
             marched.status > 0,
             places.branched,
@@ -131,184 +133,24 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     )
 
 
-# --- the wire's start -------------------------------------------------------------------------------------------------
-
-
-def _project(system, rough):
-    """The wire's point nearest to the rough start: least-norm Newton steps to reach it, then Newton on nearness."""
-    fixed, far = stop_gradient(system), stop_gradient(rough)
-
-    def least(z):
-        rows = constraint_rows(fixed.contacts, z)
-        move = -times(rows.T, solve(times(rows, rows.T), constraints(fixed.contacts, z)))
-        move = jnp.where(jnp.isfinite(move), move, 0.0)
-        return z + move * jnp.minimum(1.0, 0.3 / jnp.maximum(jnp.abs(move).max(), 1e-30))
-
-    z = jax.lax.fori_loop(0, 12, lambda _, z: least(z), far)
-    hint = _null(fixed, z)
-
-    def nearest(z, system, rough):
-        return jnp.concatenate([constraints(system.contacts, z), (tangent(system, z, hint) @ (z - rough))[None]])
-
-    root = newton(nearest, z, system, rough)
-    near = jnp.where(root.residual < digits(z, 3 / 8), root.z, z)
-    return near, jnp.abs(constraints(fixed.contacts, stop_gradient(near))).max()
-
-
-def _misplaced(system, z):
-    """Whether a contact lies beyond its feature, a vertex behind the palm, or a convex object on a finger or behind it.
-
-    Behind a finger's line, vertices of a convex object may lie where the finger's tip touches an edge, not where a
-    vertex touches the finger.
-    """
-    tolerance = digits(z, 5 / 8)
-    held, pairs = frames(system.contacts, z), frames(system.candidates, z)
-    beyond = (held.along < system.contacts.lower - tolerance) | (held.along > system.contacts.upper + tolerance)
-    inside = (pairs.along > system.candidates.lower) & (pairs.along < system.candidates.upper)
-    of_finger, held_by = system.candidates.finger > 0, (system.contacts.finger > 0) & system.contacts.on_link[:, None]
-    faces = ~of_finger.any(1) | (system.convex & (of_finger & held_by.any(0)).any(1))  # in front of them all must be
-    behind = system.watched & system.candidates.on_link & faces & inside & (pairs.gap < -tolerance)
-    return jnp.any(beyond) | jnp.any(behind) | (system.convex & _pierced(system, z, pairs.gap, tolerance))
-
-
-def _pierced(system, z, tip, tolerance):
-    """Whether part of a finger's contact edge lies within a convex object: behind all of its edges."""
-    several = system.candidates
-    root = frames(eqx.tree_at(lambda c: c.reach, several, jnp.zeros_like(several.reach)), z).gap
-    root, rise = root + tolerance, tip - root
-    cross = -root / jnp.where(rise == 0, 1.0, rise)  # where, from root (0) to tip (1), an edge's line is crossed
-    enter = jnp.where(rise < 0, cross, jnp.where((rise == 0) & (root > 0), jnp.inf, -jnp.inf))
-    leave = jnp.where(rise > 0, cross, jnp.inf)
-
-    def within(finger):
-        edges = ~several.on_link & (several.finger[:, finger] > 0) & system.real
-        first = jnp.where(edges, enter, -jnp.inf).max()
-        last = jnp.where(edges, leave, jnp.inf).min()
-        return jnp.minimum(last, 1.0) > jnp.maximum(first, 0.0)
-
-    return within(0) | within(1)
-
-
-def _dependent(system, z):
-    """Whether the constraints depend on one another at `z`: their rows span no volume."""
-    rows = constraint_rows(system.contacts, z)
-    rows = rows / jnp.sqrt((rows**2).sum(1, keepdims=True))
-    return inverse(times(rows, rows.T))[1] < digits(z, 3 / 4)
-
-
-def _null(system, z):
-    """The unit tangent at `z`, of either sense: the longest column of the projector onto what is orthogonal to `G`."""
-    rows = constraint_rows(system.contacts, z)
-    projector = jnp.eye(5, dtype=z.dtype) - times(rows.T, solve(times(rows, rows.T), rows))
-    # The projector has half of the digits where rows are nearly dependent, which is enough for a hint.
-    return tangent(system, z, projector[jnp.argmax(jnp.diag(projector))])
-
-
-def _oriented(system, z, heading):
-    """The unit tangent at `z` whose coordinate `heading.coordinate` has the sign asked for."""
-    null = _null(system, z)
-    return null * jnp.where(null[_leading(heading, null)] * heading.sign < 0, -1.0, 1.0)
-
-
-def _leading(heading, x):
-    """The coordinate that tells which way a wire goes."""
-    return jnp.where(heading.coordinate < 0, jnp.argmax(jnp.abs(x)), heading.coordinate)
-
-
-# --- ends and kinks, located as roots --------------------------------------------------------------------------------
-
-
-class _Places(NamedTuple):
-    """The wire's end and its kinks in order; `s` is infinite for unused rows."""
-
-    z: Float[Array, "places 5"]
-    s: Float[Array, "places"]
-    chart: Int[Array, "places"]
-    end: Float[Array, "5"]
-    end_s: Float[Array, ""]
-    branched: Bool[Array, ""]
-    failed: Bool[Array, ""]
-
-
-_PLANE, _END = 6, 7  # fifth equations: 0-3 slip of a contact, 4-5 speed of a joint, then these
-
-
-def _coordinate(marched, chart, z):
-    return marched.anchor_s[chart] + marched.charts[chart] @ (z - marched.anchors[chart])
-
-
-def _fifth(system, heading, marched, z, hint, plane):
-    """The equations that may fix a place on the wire beside the C-functions; the last is what ends the wire."""
-    x = tangent(system, z, hint)
-    pairs = system.candidates.lower.shape[0]
-    made = jax.tree.map(lambda a: a[jnp.clip(marched.end, 0, pairs - 1)], system.candidates)
-    held = frames(system.contacts, z)
-    room = [held.along - system.contacts.lower, system.contacts.upper - held.along]
-    ahead = heading.until_value - z[heading.until_coordinate]
-    others = jnp.concatenate([*room, ahead[None]])
-    ending = jnp.where(marched.end < pairs, frames(made, z).gap, others[jnp.maximum(marched.end - pairs, 0)])
-    still = hint @ (z - plane)
-    return jnp.concatenate([speeds_of(system, z, x), jnp.stack([still, jnp.where(marched.end < 0, still, ending)])])
-
-
-def _places(system, heading, marched, resolution):
-    """Sharpen the bracketed end and every sign change of slips and joint speeds to rounding level."""
-    fixed = stop_gradient(system)
-    last = jnp.maximum(marched.n - 1, 0)
-    (found,) = jnp.nonzero(marched.flips.ravel(), size=resolution.pieces - 1, fill_value=-1)
-    used = jnp.append(found >= 0, True)
-    segment = jnp.append(jnp.where(found >= 0, found // 7, 0), last)
-    what = jnp.append(jnp.where(found >= 0, found % 7, _PLANE), _END)
-    fraction = marched.share[segment, jnp.minimum(what, _PLANE)][:, None]
-    guess = marched.z[segment - 1] * (1 - fraction) + marched.z[segment] * fraction
-    guess = jnp.where(used[:, None], guess, marched.z[0]).at[-1].set(marched.end_z)
-
-    # A chart ends at the node before the first step in the next one.
-    chart = marched.chart[jnp.maximum(segment - (what == _PLANE), 0)]
-
-    def locate(segment, what, guess, chart):
-        hint = marched.x[jnp.maximum(segment - 1, 0)]
-
-        def equations(z, system, heading):
-            fifth = _fifth(system, heading, marched, z, hint, guess)[what]
-            return jnp.concatenate([constraints(system.contacts, z), fifth[None]])
-
-        root = newton(equations, guess, system, heading)
-        return root.z, root.residual, _coordinate(marched, chart, root.z)
-
-    z, residual, s = jax.vmap(locate)(segment, what, guess, chart)
-    slack = jnp.where(what == _END, 4 * SHORTEST, digits(z, 3 / 8))
-    before = jnp.where(segment > 0, marched.s[jnp.maximum(segment - 1, 0)], 0.0)
-    astray = (residual > digits(z, 1 / 2)) | (s < before - slack) | (s > marched.s[segment] + slack)
-    failed = jnp.any(used & astray)
-    kinks = jnp.where(used[:-1], s[:-1], jnp.inf)
-    rank = jnp.argsort(stop_gradient(kinks))
-    branched = _branches(fixed, marched, stop_gradient(z[-1]), astray[-1])
-    return _Places(z[rank], kinks[rank], chart[rank], z[-1], s[-1], branched, failed)
-
-
-def _branches(system, marched, end, astray):
-    """Whether the wire meets another one on its way: `det [G; x]` changes sign."""
-    rows, last = jnp.arange(marched.s.shape[0]), jnp.maximum(marched.n - 1, 0)
-    # The last node lies a little beyond the end: it counts only if the end was not found.
-    _, at_end = oriented_tangent(system, end, marched.x[jnp.maximum(last - 1, 0)])
-    along = jnp.where((rows == last) & ~astray, at_end, marched.orientation)
-    live = (rows < marched.n) & (rows > 0) & (marched.end >= 0)
-    size = jnp.abs(jnp.where(live, along, along[0])).max()
-    # Where two wires meet, Newton's method finds the end to half of the digits only.
-    return jnp.any(live & (along * jnp.sign(along[0]) < digits(end, 3 / 8) * size))
-
-
-# --- pieces, panels and nodes ----------------------------------------------------------------------------------------
-
-
 def chebyshev(nodes: int) -> np.ndarray:
     """Chebyshev points of the first kind on [-1, 1], increasing."""
     return -np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)
 
 
-def _cut(system, fixed, marched, places, start, resolution):
-    """Lay panels over the pieces and solve the C-functions at every node."""
+class _Laid(NamedTuple):
+    """Pieces and the charts that they lie in, as in `Wire`."""
+
+    count: Int[Array, ""]
+    breaks: Float[Array, "pieces_1"]
+    chart: Float[Array, "pieces 5"]
+    anchor: Float[Array, "pieces 5"]
+    anchor_s: Float[Array, "pieces"]
+    factor: Float[Array, "pieces"]
+
+
+def _lay(system, marched, places, start, resolution) -> _Laid:
+    """Cut the wire into its pieces, each in the chart that it is charted by."""
     inside = jnp.isfinite(places.s) & (stop_gradient(places.s) < stop_gradient(places.end_s))
     count = inside.sum() + 1
     last = marched.chart[jnp.maximum(marched.n - 1, 0)]
@@ -320,23 +162,28 @@ def _cut(system, fixed, marched, places, start, resolution):
 
     # Two charts give the place where they meet the same `s`, also where that place moves with the scene.
     before = jnp.concatenate([owner_chart[:1], owner_chart[:-1]])
-    coordinate = jax.vmap(_coordinate, (None, 0, 0))
-    jump = jnp.where(live, coordinate(marched, before, entry) - coordinate(marched, owner_chart, entry), 0.0)
+    by_chart = jax.vmap(coordinate, (None, 0, 0))
+    jump = jnp.where(live, by_chart(marched, before, entry) - by_chart(marched, owner_chart, entry), 0.0)
     shift = jnp.cumsum(jump)
     anchor_s = marched.anchor_s[owner_chart] + shift
     end_s = places.end_s + shift[-1]
     kinks = jnp.where(inside, jnp.where(inside, places.s, 0.0) + shift[:-1], end_s)
-    breaks = jnp.concatenate([_coordinate(marched, 0, start)[None], kinks, end_s[None]])
+    breaks = jnp.concatenate([coordinate(marched, 0, start)[None], kinks, end_s[None]])
 
     old = marched.charts[before]
     x_entry = jax.vmap(lambda z, u: tangent(system, z, u))(entry, old)
     factor = jnp.where(live, (chart * x_entry).sum(1) / (old * x_entry).sum(1), 1.0)
+    return _Laid(count, breaks, chart, anchor, anchor_s, factor)
 
-    first, panels, owner = _panels(stop_gradient(breaks), count, resolution)
+
+def _cut(system, fixed, marched, places, start, resolution):
+    """Lay panels over the pieces and solve the C-functions at every node."""
+    laid = _lay(system, marched, places, start, resolution)
+    first, panels, owner = _panels(stop_gradient(laid.breaks), laid.count, resolution)
     local = (jnp.arange(resolution.panels) - first[owner])[:, None] + (chebyshev(resolution.nodes) + 1) / 2
-    low, high = breaks[owner][:, None], breaks[owner + 1][:, None]
+    low, high = laid.breaks[owner][:, None], laid.breaks[owner + 1][:, None]
     s = low + (high - low) * local / panels[owner][:, None]
-    guess = _interpolate(marched, places, stop_gradient(s), chart[owner])
+    guess = _interpolate(marched, stop_gradient(s), laid.chart[owner])
 
     def node(s, guess, u, anchor, anchor_s):
         height = u @ anchor + s - anchor_s
@@ -346,10 +193,11 @@ def _cut(system, fixed, marched, places, start, resolution):
             return jnp.concatenate([constraints(system.contacts, z), (u @ z - height)[None]])
 
         found = z - times(stop_gradient(inverted), equations(stop_gradient(z), system, height))
-        return found, moved, speeds_of(fixed, stop_gradient(found), _refined(fixed, stop_gradient(found), u, inverted))
+        here = stop_gradient(found)
+        return found, moved, speeds_of(fixed, here, _refined(fixed, here, u, inverted))
 
     per_panel = jax.vmap(node, (0, 0, None, None, None))
-    nodes, moved, speeds = jax.vmap(per_panel)(s, guess, chart[owner], anchor[owner], anchor_s[owner])
+    nodes, moved, speeds = jax.vmap(per_panel)(s, guess, laid.chart[owner], laid.anchor[owner], laid.anchor_s[owner])
     slip_sign, joint_sign, missed = _signs(stop_gradient(speeds), owner, resolution)
     pairs = system.candidates.lower.shape[0]
     contact = jnp.where(marched.end < pairs, marched.end, (marched.end - pairs) % 4)
@@ -362,18 +210,13 @@ def _cut(system, fixed, marched, places, start, resolution):
         end_contact=contact,
         residual=jnp.zeros(()),
         start_gaps=jnp.zeros(4),
-        count=count,
-        breaks=breaks,
-        chart=chart,
-        anchor=anchor,
-        anchor_s=anchor_s,
-        factor=factor,
         slip_sign=slip_sign,
         joint_sign=joint_sign,
         first=first,
         panels=panels,
         owner=owner,
         nodes=nodes,
+        **laid._asdict(),
     )
 
 
@@ -398,7 +241,7 @@ def _panels(breaks, count, resolution):
     return first, panels, owner
 
 
-def _interpolate(marched, places, s, u):
+def _interpolate(marched, s, u):
     """Cubic Hermite guess of `z` at every `s` from the march's nodes."""
     right = jnp.clip(jnp.searchsorted(marched.s, s), 1, jnp.maximum(marched.n - 1, 1))
     left = right - 1

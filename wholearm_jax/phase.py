@@ -1,0 +1,133 @@
+"""One phase: trace its wire and tabulate it, simulate it, score it and judge it; and where it begins and ends.
+
+Two compiled programs serve every phase of every scene: `prepare` (trace and reduce) and `run` (simulate, score, judge).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from wholearm_jax.forces import Score, score
+from wholearm_jax.holding import Departure, Statics, statics
+from wholearm_jax.motion import Motion, move
+from wholearm_jax.programs import Program
+from wholearm_jax.reduction import Change, Table, change, horner, powers, reduce_wire
+from wholearm_jax.scene import Phase, Scene, contact_name
+from wholearm_jax.schedule import Torque, window
+from wholearm_jax.stepping import Integration
+from wholearm_jax.system import system
+from wholearm_jax.verdict import ARRIVAL, GOALS, Verdict, judge
+from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
+
+
+class Traced(NamedTuple):
+    """A phase's wire and its table."""
+
+    wire: Wire
+    table: Table
+
+
+class Outcome(NamedTuple):
+    """A simulated phase as arrays: when it begins and how long it may take [s], the change of formation by which it is
+    entered, what happens, and `z_dot` (SI) at its end."""
+
+    start: Float[Array, ""]
+    duration: Float[Array, ""]
+    entered: Change
+    motion: Motion
+    score: Score
+    verdict: Verdict
+    leaving: Float[Array, "5"]
+
+
+@Program
+def prepare(scene_body, hand, gravity, formation, rough, heading, resolution: Resolution = Resolution()) -> Traced:
+    """Trace a formation's wire from a rough start (SI) and tabulate its reduced dynamics."""
+    mechanics = system(scene_body, hand, gravity, formation)
+    wire = trace_wire(mechanics, rough, heading, resolution)
+    # Weak types, which depend on how a constant was written, would make a second program of the next one.
+    return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), Traced(wire, reduce_wire(mechanics, wire)))
+
+
+def run(
+    table: Table, schedule: Torque, start, duration, how: Integration, goal, arriving=None, arrival=ARRIVAL
+) -> Outcome:
+    """Simulate one phase from its wire's start, score it and judge whether it ends as `goal` says: a word as in
+    `Phase.arrive`, or a number of `GOALS`.
+
+    `arriving` is `z_dot` (SI) at the end of the phase before, for a change of formation while moving (None: at rest);
+    `arrival` how near the wire's end the phase must come (`verdict`).
+    """
+    dtype = table.breaks.dtype
+    arriving = jnp.asarray(np.zeros(5), dtype) if arriving is None else arriving
+    start, duration, arrival = (jnp.asarray(a, dtype) for a in (start, duration, arrival))
+    goal = jnp.asarray(GOALS[goal] if isinstance(goal, str) else goal)
+    return _run(table, schedule, start, duration, arriving, how, goal, arrival)
+
+
+@Program
+def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integration, goal, arrival) -> Outcome:
+    seen = window(schedule, start, duration)
+    entered = change(table, arriving)
+    motion = move(table, seen, duration, how=how, speed=jnp.maximum(entered.speed, 0.0))
+    scored = score(table, seen, duration, motion, how)
+    verdict = judge(table, motion, scored, goal, entered, arrival)
+    last = jnp.maximum(motion.count - 1, 0)
+    panel, xi = powers(table, motion.piece[last], motion.s[motion.count])
+    leaving = horner(table.velocity[panel], xi) * motion.w[motion.count] / duration
+    return Outcome(start, duration, entered, motion, scored, verdict, leaving)
+
+
+@jax.jit
+def configuration(table: Table, piece: Int[Array, ""], s: Float[Array, ""]) -> Float[Array, "5"]:
+    """`z` (SI) at a place of a wire."""
+    panel, xi = powers(table, piece, s)
+    return horner(table.configuration[panel], xi)
+
+
+@jax.jit
+def end_configuration(traced: Traced) -> Float[Array, "5"]:
+    """`z` (SI) where a wire ends."""
+    return configuration(traced.table, traced.table.count - 1, traced.table.breaks[-1])
+
+
+@jax.jit
+def start_configuration(table: Table) -> Float[Array, "5"]:
+    """`z` (SI) where a wire starts."""
+    return configuration(table, jnp.asarray(0), table.breaks[0])
+
+
+def final_configuration(table: Table, motion: Motion) -> Float[Array, "5"]:
+    """`z` (SI) where a motion has come to."""
+    return configuration(table, motion.piece[jnp.maximum(motion.count - 1, 0)], motion.s[motion.count])
+
+
+def destination(phase: Phase, traced: Traced) -> Float[Array, "5"]:
+    """`z` (SI) where a phase should end: at its wire's end, or where it began if it holds the object."""
+    return start_configuration(traced.table) if phase.arrive == "hold" else end_configuration(traced)
+
+
+def balance_at_start(scene: Scene, phase: Phase, traced: Traced) -> tuple[Statics, Departure]:
+    """The statics where a phase begins, and the accelerations with which the object would leave."""
+    table = traced.table
+    panel, xi = powers(table, jnp.asarray(0), table.breaks[0])
+    ahead, behind = jax.device_get((horner(table.acceleration[panel], xi), horner(table.backward[panel], xi)))
+    balance = statics(scene, phase.formation, start_configuration(table))
+    return balance, Departure(ahead[[0, 3, 4]], behind)
+
+
+def ending(traced: Traced, phase: Phase, capacity: int) -> str:
+    """Why a phase ends, in words."""
+    if phase.arrive == "hold":
+        return "the object is held"
+    why, index = int(traced.wire.end_why), int(traced.wire.end_contact)
+    if why == MADE:
+        group, feature = divmod(index, capacity)
+        link, kind = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1))[group]
+        return f"{contact_name(link, kind, feature)} is made"
+    if why == LEFT:
+        return f"{phase.formation.names[phase.formation.contact_of_slot[index]]} leaves its feature"
+    return "the phase's own limit is reached" if why == UNTIL else "no end was found"

@@ -1,0 +1,98 @@
+"""Places on a wire: its end and its kinks, each the root of five equations, and whether it meets another wire.
+
+Derivation: section 3 of `docs/derivation.md`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
+
+from wholearm_jax.contacts import constraints, frames
+from wholearm_jax.march import SHORTEST, March, oriented_tangent, speeds_of, tangent
+from wholearm_jax.newton import newton
+from wholearm_jax.precision import digits
+
+
+class Places(NamedTuple):
+    """The wire's end and its kinks in order; `s` is infinite for unused rows."""
+
+    z: Float[Array, "places 5"]
+    s: Float[Array, "places"]
+    chart: Int[Array, "places"]
+    end: Float[Array, "5"]
+    end_s: Float[Array, ""]
+    branched: Bool[Array, ""]
+    failed: Bool[Array, ""]
+
+
+_PLANE, _END = 6, 7  # fifth equations: 0-3 slip of a contact, 4-5 speed of a joint, then these
+
+
+def places_of(system, heading, marched: March, most: int) -> Places:
+    """Sharpen the bracketed end and every sign change of slips and joint speeds to rounding level: `most` places."""
+    fixed = stop_gradient(system)
+    last = jnp.maximum(marched.n - 1, 0)
+    (found,) = jnp.nonzero(marched.flips.ravel(), size=most - 1, fill_value=-1)
+    used = jnp.append(found >= 0, True)
+    segment = jnp.append(jnp.where(found >= 0, found // 7, 0), last)
+    what = jnp.append(jnp.where(found >= 0, found % 7, _PLANE), _END)
+    fraction = marched.share[segment, jnp.minimum(what, _PLANE)][:, None]
+    guess = marched.z[segment - 1] * (1 - fraction) + marched.z[segment] * fraction
+    guess = jnp.where(used[:, None], guess, marched.z[0]).at[-1].set(marched.end_z)
+
+    # A chart ends at the node before the first step in the next one.
+    chart = marched.chart[jnp.maximum(segment - (what == _PLANE), 0)]
+
+    def locate(segment, what, guess, chart):
+        hint = marched.x[jnp.maximum(segment - 1, 0)]
+
+        def equations(z, system, heading):
+            fifth = _fifth(system, heading, marched, z, hint, guess)[what]
+            return jnp.concatenate([constraints(system.contacts, z), fifth[None]])
+
+        root = newton(equations, guess, system, heading)
+        return root.z, root.residual, coordinate(marched, chart, root.z)
+
+    z, residual, s = jax.vmap(locate)(segment, what, guess, chart)
+    slack = jnp.where(what == _END, 4 * SHORTEST, digits(z, 3 / 8))
+    before = jnp.where(segment > 0, marched.s[jnp.maximum(segment - 1, 0)], 0.0)
+    astray = (residual > digits(z, 1 / 2)) | (s < before - slack) | (s > marched.s[segment] + slack)
+    failed = jnp.any(used & astray)
+    kinks = jnp.where(used[:-1], s[:-1], jnp.inf)
+    rank = jnp.argsort(stop_gradient(kinks))
+    branched = _branches(fixed, marched, stop_gradient(z[-1]), astray[-1])
+    return Places(z[rank], kinks[rank], chart[rank], z[-1], s[-1], branched, failed)
+
+
+def _fifth(system, heading, marched, z, hint, plane):
+    """The equations that may fix a place on the wire beside the C-functions; the last is what ends the wire."""
+    x = tangent(system, z, hint)
+    pairs = system.candidates.lower.shape[0]
+    made = jax.tree.map(lambda a: a[jnp.clip(marched.end, 0, pairs - 1)], system.candidates)
+    held = frames(system.contacts, z)
+    room = [held.along - system.contacts.lower, system.contacts.upper - held.along]
+    ahead = heading.until_value - z[heading.until_coordinate]
+    others = jnp.concatenate([*room, ahead[None]])
+    ending = jnp.where(marched.end < pairs, frames(made, z).gap, others[jnp.maximum(marched.end - pairs, 0)])
+    still = hint @ (z - plane)
+    return jnp.concatenate([speeds_of(system, z, x), jnp.stack([still, jnp.where(marched.end < 0, still, ending)])])
+
+
+def _branches(system, marched, end, astray):
+    """Whether the wire meets another one on its way: `det [G; x]` changes sign."""
+    rows, last = jnp.arange(marched.s.shape[0]), jnp.maximum(marched.n - 1, 0)
+    # The last node lies a little beyond the end: it counts only if the end was not found.
+    _, at_end = oriented_tangent(system, end, marched.x[jnp.maximum(last - 1, 0)])
+    along = jnp.where((rows == last) & ~astray, at_end, marched.orientation)
+    live = (rows < marched.n) & (rows > 0) & (marched.end >= 0)
+    size = jnp.abs(jnp.where(live, along, along[0])).max()
+    # Where two wires meet, Newton's method finds the end to half of the digits only.
+    return jnp.any(live & (along * jnp.sign(along[0]) < digits(end, 3 / 8) * size))
+
+
+def coordinate(marched: March, chart, z):
+    """Where along the wire `z` is, by one of its charts."""
+    return marched.anchor_s[chart] + marched.charts[chart] @ (z - marched.anchors[chart])

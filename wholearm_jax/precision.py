@@ -1,0 +1,16 @@
+"""Precision: what counts as zero, and what needs 64 bits."""
+
+import jax.numpy as jnp
+
+
+def digits(values, share: float):
+    """What is zero to a share of a precision's digits: 1.6e-10 for five eighths of float64's, 5e-5 of float32's."""
+    return jnp.finfo(values.dtype).eps ** share
+
+
+def require_x64() -> None:
+    """Raise unless JAX computes in 64 bits: the statuses' tolerances need them."""
+    if jnp.zeros(()).dtype != jnp.float64:
+        raise RuntimeError(
+            "this function needs float64; call jax.config.update('jax_enable_x64', True) before importing arrays"
+        )
