@@ -167,13 +167,17 @@ def end_is_real(model: Model, z, why, contact, until, tolerance) -> np.ndarray:
     which = np.minimum(contact, 3)
     at_limit = np.minimum(np.abs(along - low), np.abs(along - high))[row, which] < tolerance
     capacity = model.vertices.shape[1]
-    group, feature = np.minimum(contact // capacity, 4), contact % capacity
+    group, feature = contact // capacity, contact % capacity
+    corner = group >= 5
+    group = np.where(corner, 0, group)
     other = model.take(np.arange(len(z)))
     other.link = np.repeat(np.array([0, 1, 2, 1, 2])[group][:, None], 4, axis=1)
     other.kind = np.repeat(np.array([0, 0, 0, 1, 1])[group][:, None], 4, axis=1)
     other.feature = np.repeat(feature[:, None], 4, axis=1)
     other.tangential = np.zeros_like(other.tangential)
     made = np.abs(other.geometry(z).gap[:, 0, 0]) < tolerance
+    met_corner = model.corner_from_edge(z, np.maximum(contact // capacity - 5, 0), feature) < tolerance
+    made = np.where(corner, met_corner, made)
     coordinate, value = until
     met = np.abs(z[row, 0, coordinate] - value) < tolerance
     return np.select([why == MADE, why == BEYOND, why == UNTIL], [made, at_limit, met], False)

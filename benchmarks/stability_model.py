@@ -231,27 +231,22 @@ class Model:
         return np.any(real & (np.min(gaps, axis=0) < -1e-9), axis=2)
 
     def depth(self, z):
-        """How deep contact edges, and how deep roots of fingers and ends of the palm, are in the object (0: outside).
+        """How deep the palm and the fingers' contact edges are in the object (scenes, places); 0 outside.
 
-        Two arrays (scenes, places). The points looked at are the feet of all vertices on a contact edge, its ends, and
-        the middles between the places where its line crosses the object's edges.
+        The points looked at are the feet of all vertices on each, its ends, and the middles between the places where
+        its line crosses the object's edges.
         """
-        away, directions = self._poses(z)
-        points = z[..., None, :2] + away
-        real = (np.arange(points.shape[2]) < self.count[:, None])[:, None]
-        within = (points[..., 0] > self.joint[:, None, 1:, 0]) & (points[..., 0] < self.joint[:, None, :1, 0])
-        worst = np.where(real & within, -points[..., 1], 0.0).max(2)
-        after = np.broadcast_to(self.following()[:, None, :, None], points.shape)
-        following = np.take_along_axis(points, after, axis=2)
-        joint, length, offset, side = self._links()
-        ends = np.stack([self.joint[:, :, 0], np.zeros_like(self.joint[:, :, 0])], axis=2)[:, None]
-        roots = [np.broadcast_to(ends, (*z.shape[:2], 2, 2))]
-        for link in (1, 2):
-            d = directions[..., link, :]
-            start = joint[:, None, link] + offset[:, None, link, None] * side[link] * quarter(d)
-            reach = length[:, None, link, None]
+        points, following, real = self.outline(z)
+        root1, root2, end1, end2 = np.moveaxis(self.corners(z), 2, 0)
+        _, length, _, _ = self._links()
+        _, directions = self._poses(z)
+        worst = np.zeros(z.shape[:2])
+        starts = (end2, root1, root2)
+        reaches = (end1[..., :1] - end2[..., :1], length[:, None, 1, None], length[:, None, 2, None])
+        for link, (start, reach) in enumerate(zip(starts, reaches, strict=True)):
+            d, reach = directions[..., link, :], np.broadcast_to(reach, (*z.shape[:2], 1))
             feet = np.where(real, np.clip(dot(d[:, :, None], points - start[:, :, None]), 0.0, reach), 0.0)
-            feet = np.concatenate([feet, np.broadcast_to(reach, (*z.shape[:2], 1)), 0 * feet[:, :, :1]], axis=2)
+            feet = np.concatenate([feet, reach, 0 * reach], axis=2)
             aside = dot(quarter(d)[:, :, None], points - start[:, :, None])
             other = dot(quarter(d)[:, :, None], following - start[:, :, None])
             share = aside / np.where(aside == other, np.inf, aside - other)
@@ -262,8 +257,40 @@ class Model:
             feet = np.concatenate([feet, (stops[..., 1:] + stops[..., :-1]) / 2], axis=2)
             probes = start[:, :, None] + feet[..., None] * d[:, :, None]
             worst = np.maximum(worst, _inside(probes, points, following, real).max(2))
-            roots.append(start[:, :, None])
-        return np.maximum(worst, 0.0), _inside(np.concatenate(roots, axis=2), points, following, real).max(2)
+        return worst
+
+    def corners(self, z) -> np.ndarray:
+        """Where the fingers' roots and the palm's ends at both fingers are: (scenes, places, 4, 2)."""
+        _, directions = self._poses(z)
+        joint, _, offset, side = self._links()
+        roots = [
+            joint[:, None, link] + offset[:, None, link, None] * side[link] * quarter(directions[..., link, :])
+            for link in (1, 2)
+        ]
+        ends = [np.broadcast_to(joint[:, None, link] * [1.0, 0.0], roots[0].shape) for link in (1, 2)]
+        return np.stack([*roots, *ends], axis=2)
+
+    def corner_from_edge(self, z, corner, feature) -> np.ndarray:
+        """How far one of `corners` is from an edge (scenes), at the first place."""
+        row = np.arange(len(z))
+        points, following, _ = self.outline(z)
+        begin, edge = points[row, 0, feature], (following - points)[row, 0, feature]
+        away = self.corners(z)[row, 0, np.minimum(corner, 3)] - begin
+        share = np.clip(dot(away, edge) / np.maximum(dot(edge, edge), 1e-300), 0.0, 1.0)
+        left = away - share[:, None] * edge
+        return np.sqrt(dot(left, left))
+
+    def depth_of_corners(self, z) -> np.ndarray:
+        """How deep roots of fingers and ends of the palm are in the object (scenes, places); 0 outside."""
+        points, following, real = self.outline(z)
+        return _inside(self.corners(z), points, following, real).max(2)
+
+    def outline(self, z):
+        """The object's vertices, the next one of each (scenes, places, vertices, 2), and which are real."""
+        points = z[..., None, :2] + self._poses(z)[0]
+        real = (np.arange(points.shape[2]) < self.count[:, None])[:, None]
+        after = np.broadcast_to(self.following()[:, None, :, None], points.shape)
+        return points, np.take_along_axis(points, after, axis=2), real
 
     def curve(self, z, chart):
         """`dz/ds` and `d2z/ds2` in a chart: `G_n x = 0`, `u.x = 1`, `G_n x' = -G_n_dot x`, `u.x' = 0`."""

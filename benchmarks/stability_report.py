@@ -35,7 +35,6 @@ def summary(found) -> dict:
         "violations": {name: int((wrong >> bit & 1).sum()) for bit, name in enumerate(VIOLATIONS)},
         "scenes_with_violations": int((wrong != 0).sum()),
         "examples_of_violations": examples(found),
-        "object_passes_a_root_or_the_palm_end": int(found["corner"].sum()),
         "residual_quantiles": {
             name: dict(zip(map(str, QUANTILES), quantiles(found[name]), strict=True)) for name in RESIDUALS + EXCESSES
         },

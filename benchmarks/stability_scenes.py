@@ -290,7 +290,7 @@ def _touching(rng, shape, *, symmetric, places=40, rounds=46):
 def _free_roots(shape, formation, z):
     """Whether the fingers' roots and the palm's ends lie outside the object."""
     model = Model.in_object_units(shape, formation, np.zeros((len(z), 3)), np.ones((len(z), 2)))
-    return model.depth(z[:, None])[1][:, 0] < 1e-9
+    return model.depth_of_corners(z[:, None])[:, 0] < 1e-9
 
 
 def _pinned(formation, count):

@@ -118,7 +118,9 @@ def blank(scenes: Scenes):
     real = ("margin", "scale", "condition", "table_error", "length", "travel", "end_share", *RESIDUALS, *EXCESSES)
     found = {name: np.zeros(n, int) for name in whole} | {name: np.full(n, np.nan) for name in real}
     found |= {"torque": np.zeros((n, *scenes.noise.shape[1:]))}
-    found |= {"moved": np.zeros(n, bool), "corner": np.zeros(n, bool), "slope": np.zeros(n)}
+    found |= {
+        "moved": np.zeros(n, bool),
+    }
     return found | {"family": scenes.family, "exact": scenes.exact, "at_rest": scenes.at_rest}
 
 
@@ -204,9 +206,9 @@ def refuse(found, scenes, some, wires, tables, status, which, limits):
         ASTRAY,
     )
     out = checks.outside(model, start[:, None])[:, 0]
-    deep = model.depth(start[:, None])
+    deep = np.maximum(model.depth(start[:, None]), model.depth_of_corners(start[:, None]))[:, 0]
     behind = model.crossing(start[:, None])[:, 0]
-    in_place = (out < limits.closure) & (deep[0][:, 0] < limits.closure) & ~behind
+    in_place = (out < limits.closure) & (deep < limits.closure) & ~behind
     flag(found, rows, "refused although in place", (reason == MISPLACED) & in_place)
     flag(found, rows, "refused although touching", (reason == APART) & some.exact & (status != checks.LEFT))
     rank = np.flatnonzero((reason == RANK) | (reason == ASTRAY))
@@ -276,26 +278,14 @@ def check_wire(found, rows, some, model, units, wires, tables, result, limits):
     found["seam"][rows] = result.seam
     found["sign"][rows] = checks.wire_signs(model, along).max(1)
     found["beyond"][rows] = checks.outside(model, along["z"]).max(1)
-    depth, corner = depths(model, along["z"])
-    unexplained = np.flatnonzero((depth.max(1) > limits.place) & ~(corner.max(1) > limits.place))
-    if len(unexplained):
-        z = along["z"][unexplained]
-        part = np.linspace(0, 1, 96, endpoint=False)[:, None]
-        between = (z[:, :-1, None] * (1 - part) + z[:, 1:, None] * part).reshape(len(z), -1, 5)
-        # A root may be in the object where no vertex is behind its link: look at every place.
-        corner[unexplained, 0] = model.take(unexplained).depth(between)[1].max(1)
-    found["depth"][rows] = depth.max(1)
-    found["corner"][rows] = corner.max(1) > limits.place
+    found["depth"][rows] = depths(model, along["z"]).max(1)
     flag(found, rows, "closure", found["closure"][rows] > limits.closure)
     flag(found, rows, "tangent", found["tangent"][rows] > limits.tables)
     flag(found, rows, "equations of the table", found["columns"][rows] > limits.tables)
     flag(found, rows, "seam between pieces", found["seam"][rows] > limits.tables)
     flag(found, rows, "sign within a piece", found["sign"][rows] > limits.sign)
     flag(found, rows, "contact beyond its feature", found["beyond"][rows] > limits.place)
-    # The model has no contact at a finger's root or the palm's end: what enters there is counted apart.
-    deep = (found["depth"][rows] > limits.place) & ~found["corner"][rows]
-    flag(found, rows, "link in the object", deep & (depth[:, 0] < limits.place))
-    found["slope"][rows] = deep & (depth[:, 0] > limits.place)
+    flag(found, rows, "link in the object", found["depth"][rows] > limits.place)
     until = some.until_coordinate, some.until_value / units.z[np.arange(len(rows)), some.until_coordinate]
     real = checks.end_is_real(model, along["z"][:, -1], wires.end_why, wires.end_contact, until, limits.place)
     flag(found, rows, "end without a cause", ~real)
@@ -308,13 +298,13 @@ def check_wire(found, rows, some, model, units, wires, tables, result, limits):
 
 
 def depths(model, z):
-    """`Model.depth` at the places where an object's vertex lies behind a link."""
+    """How deep the hand is in the object: corners everywhere, edges where an object's vertex lies behind a link."""
+    depth = model.depth_of_corners(z)
     lane, place = np.nonzero(model.crossing(z))
-    depth, corner = np.zeros((2, *z.shape[:2]))
     if len(lane):
-        deep, roots = model.take(lane).depth(z[lane, place][:, None])
-        depth[lane, place], corner[lane, place] = deep[:, 0], roots[:, 0]
-    return depth, corner
+        edges = model.take(lane).depth(z[lane, place][:, None])[:, 0]
+        depth[lane, place] = np.maximum(depth[lane, place], edges)
+    return depth
 
 
 def check_motion(found, rows, model, units, result, limits):

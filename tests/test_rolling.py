@@ -2,14 +2,13 @@
 
 import copy
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import unreduced
 from test_against_unreduced import passing
-from test_gradients import nearest_difference
+from test_gradients import assert_modes_and_differences_agree
 
 import wholearm_jax
 from wholearm_jax import scene_file, squeeze
@@ -281,30 +280,7 @@ def test_gradients():
     data["phase"][0]["duration"] = 0.6
     scene = wholearm_jax.parse(data)
     even = wholearm_jax.quasistatic(scene)
-    torque = Torque(1.01 * even.times, 1.01 * even.values)
-    floats, rest = eqx.partition((scene, torque.values), eqx.is_inexact_array)
-
-    def value(floats):
-        scene, values = eqx.combine(floats, rest)
-        return wholearm_jax.margin(
-            scene, Torque(torque.times, values), how=Integration(adjoint="both", tolerance=1e-12)
-        )
-
-    reverse = jax.grad(value)(floats)
-    rng = np.random.default_rng(5)
-    leaves, shape = jax.tree.flatten(floats)
-    for which in range(len(leaves)):
-        way = [np.zeros(leaf.shape) for leaf in leaves]
-        way[which] = rng.normal(size=leaves[which].shape) * (np.abs(leaves[which]).max() + 1e-3) * 0.1
-        way = jax.tree.unflatten(shape, [jnp.asarray(w) for w in way])
-        _, forward = jax.jvp(value, (floats,), (way,))
-        pairs = zip(jax.tree.leaves(reverse), jax.tree.leaves(way), strict=True)
-        assert forward == pytest.approx(sum(float((a * b).sum()) for a, b in pairs), rel=1e-10, abs=1e-12)
-
-        def moved(h, way=way):
-            return float(value(jax.tree.map(lambda start, step: start + h * step, floats, way)))
-
-        assert forward == pytest.approx(nearest_difference(moved, forward), rel=1e-7, abs=1e-9)
+    assert_modes_and_differences_agree(scene, Torque(1.01 * even.times, 1.01 * even.values))
 
 
 def test_mirror_image():

@@ -8,19 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.path import Path
 from test_gradients import nearest_difference
 
 import wholearm_jax as wa
-from wholearm_jax.contacts import gaps
+from wholearm_jax.contacts import frames, gaps
 from wholearm_jax.forces import REFINED, SAMPLES, arc, score
 from wholearm_jax.march import Watched, crossings
 from wholearm_jax.motion import move
-from wholearm_jax.phase import end_configuration, prepare
+from wholearm_jax.phase import end_configuration, ending, prepare
 from wholearm_jax.plan import outcomes
 from wholearm_jax.reduction import balance, blank, horner, powers
 from wholearm_jax.scene import body
 from wholearm_jax.schedule import window
 from wholearm_jax.squeeze import hold, holds
+from wholearm_jax.start import _pierced
 from wholearm_jax.stepping import Integration
 from wholearm_jax.system import system
 from wholearm_jax.wire import Resolution
@@ -263,6 +265,47 @@ def test_a_convex_object_is_not_held_by_a_finger_s_back():
     near = scene(upper + lower, contacts, "theta1+", start, joint=joints, length=1.86075, offset=offset)
     near = eqx.tree_at(lambda s: s.hand.joint, near, near.hand.joint.at[0, 1].set(-0.38341))
     assert int(wa.trace(near)[0].table.status) == wa.Status.LEFT_FORMATION
+
+
+@pytest.mark.parametrize(
+    ("offset", "corner"), [(0.0, "finger1's root"), (-0.01, "the palm's end at finger1"), (0.01, "finger1's root")]
+)
+def test_the_hand_s_corners_stop_the_object(offset, corner):
+    """A block tips over its lower right corner: its side comes down on the palm's end, or on a root in front of it."""
+    block = [[-0.3, -0.5], [0.3, -0.5], [0.3, 0.5], [-0.3, 0.5]]
+    start = [0.857, 0.46, -1.2, 0.52, 0.476]
+    contacts = ["palm:v1 rolling", "finger1:v2", "finger2:v0"]
+    tipping = scene(block, contacts, "phi-", start, joint=(0.8, -0.8), length=2.5, offset=(offset, 0.0))
+    traced = wa.trace(tipping)[0]
+    assert int(traced.table.status) == wa.Status.OK
+    assert ending(traced, tipping.phases[0], 8) == f"e1 meets {corner}"
+    x, y, phi, theta, _ = np.asarray(end_configuration(traced))
+    met = np.array([0.8, 0.0]) + max(offset, 0.0) * np.array([-np.sin(theta), np.cos(theta)])
+    across = np.array([np.cos(phi), np.sin(phi)]) @ (met - [x, y])
+    assert across == pytest.approx(0.3, abs=1e-12)
+    assert (phi == pytest.approx(-np.pi / 2, abs=1e-12)) == (offset <= 0)
+
+
+def test_links_within_an_object_of_any_shape():
+    """Parts of fingers and of the palm within polygons that are not convex, as another library sees them."""
+    rng, found = np.random.default_rng(4), []
+    for _ in range(60):
+        angle, radius = np.sort(rng.uniform(0, 2 * np.pi, 11)), rng.uniform(0.2, 1.2, 11)
+        star = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+        contacts = ["palm:v0", "palm:v1", "finger1:v2", "finger2:v3"]
+        holding = scene(star.tolist(), contacts, "x+", [0.0] * 5, joint=(1, -1), length=2, offset=(0.2, -0.2))
+        near, z = mechanics(holding), np.append(rng.normal(size=2) * 2 + [0, 1], rng.uniform(0, np.pi, 3))
+        turn = np.array([[np.cos(z[2]), np.sin(z[2])], [-np.sin(z[2]), np.cos(z[2])]])
+        outline = Path(np.asarray(body(holding.object).vertices)[:11] @ turn + z[:2])
+        share, links = np.linspace(0, 1, 2001)[:, None], [np.linspace([-1, 0], [1, 0], 2001)]
+        for x, theta in ((1, z[3]), (-1, z[4])):
+            root = [x - 0.2 * np.sin(theta), 0.2 * np.cos(theta)]
+            links.append(root + 2 * share * [np.cos(theta), np.sin(theta)])
+        expected = bool(outline.contains_points(np.concatenate(links)).any())
+        pairs = frames(near.candidates, jnp.asarray(z) / near.configuration_unit)
+        assert bool(_pierced(near, pairs, 1e-10)) == expected
+        found.append(expected)
+    assert 10 < sum(found) < 50
 
 
 def test_too_few_steps_are_always_said():

@@ -18,16 +18,28 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.phase import Outcome, Traced, end_configuration, final_configuration, prepare, run
-from wholearm_jax.plan import joined, require_covered, require_motion, simulate, steps_within
+from wholearm_jax.phase import Outcome, Traced, final_configuration
+from wholearm_jax.plan import (
+    require_covered,
+    require_motion,
+    simulate,
+    simulate_first,
+    simulate_next,
+    simulate_told,
+    stacked,
+    steps_within,
+    trace_first,
+    trace_next,
+    trace_told,
+)
 from wholearm_jax.precision import require_x64
 from wholearm_jax.result import Result
-from wholearm_jax.scene import Formation, Heading, Scene, body
+from wholearm_jax.scene import Formation, Scene, body
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
 from wholearm_jax.variation import Ensemble, stack
-from wholearm_jax.verdict import ARRIVAL, GOALS
+from wholearm_jax.verdict import ARRIVAL
 from wholearm_jax.wire import Resolution
 
 BLOCK = 128  # scenes that one device takes at once
@@ -99,16 +111,6 @@ class Given(eqx.Module):
     def part(self, numbers: np.ndarray) -> "Given":
         """Some of the scenes, numbered anew."""
         return Given(jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), self.scenes))
-
-
-class _Phases(NamedTuple):
-    """The phases of a plan along a leading axis."""
-
-    formation: Formation
-    heading: Heading
-    duration: Float[Array, "phases"]
-    goal: Int[Array, "phases"]
-    moving: Bool[Array, "phases"]
 
 
 class _Stop(NamedTuple):
@@ -228,32 +230,22 @@ def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Leve
 def check_scene(scene: Scene, schedule: Torque, arrival, level: Level) -> tuple[Checked, Bool[Array, ""]]:
     """Check one scene (under any transformation), and say whether this level's result is good enough."""
     solid = body(scene.object)
-    phases = [
-        _Phases(p.formation, p.heading, p.duration, jnp.asarray(GOALS[p.arrive]), jnp.asarray(p.arrive == "moving"))
-        for p in scene.phases
-    ]
-    zero = jnp.zeros((), scene.start.dtype)
 
-    def one(at, phase: _Phases):
-        rough, start, planned, arriving, first = at
-        planned = planned + phase.duration
-        traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, level.resolution)
-        after = joined(traced, rough)
-        traced = jax.tree.map(lambda a, b: jnp.where(first, a, b), traced, after)
-        done = run(traced.table, schedule, start, planned - start, level.how, phase.goal, arriving, arrival)
-        stop = _stop(traced, done, phase.formation, level)
-        left = start + done.duration * done.motion.share[done.motion.count]
-        start = jnp.where(phase.moving, left, planned)
-        arriving = jnp.where(phase.moving, done.leaving, 0.0)
-        return (end_configuration(traced), start, planned, arriving, jnp.asarray(False)), stop
+    def one(at, phase):
+        place, clock = at
+        wire, motion, formation = phase
+        place, traced = trace_next(scene, solid, level.resolution, place, wire)
+        clock, done = simulate_next(schedule, level.how, arrival, clock, (traced.table, *motion))
+        return (place, clock), _stop(traced, done, formation, level)
 
-    begin = (scene.start, zero, zero, jnp.zeros(5, zero.dtype), jnp.asarray(True))
-    _, stops = jax.lax.scan(one, begin, jax.tree.map(lambda *leaves: jnp.stack(leaves), *phases))
+    begin = trace_first(scene), simulate_first(schedule)
+    phases = stacked([(trace_told(p), simulate_told(p), p.formation) for p in scene.phases])
+    _, stops = jax.lax.scan(one, begin, phases)
     failed = stops.status != int(Status.OK)
     where = jnp.where(failed.any(), jnp.argmax(failed), jnp.argmin(stops.margin))
-    last = jnp.where(failed.any(), where, len(phases) - 1)
+    last = jnp.where(failed.any(), where, len(scene.phases) - 1)
     # What follows a failure counts for nothing but the margin.
-    needed = jnp.arange(len(phases)) <= last
+    needed = jnp.arange(len(scene.phases)) <= last
     ok = ~failed.any()
     answer = Checked(
         status=stops.status[where],

@@ -20,9 +20,13 @@ Derivation: section 1 of `docs/derivation.md`.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from wholearm_jax.scene import EDGE, VERTEX, Body, Formation, Hand, next_vertex
+
+ROOT, PALM_END = 2, 3  # corners that no formation holds, at an edge of the object: where a finger or the palm begins
+CORNER = 1e-6  # length units of an edge beside its ends at which it is a vertex of the object that meets such a corner
 
 
 class Contacts(eqx.Module):
@@ -60,27 +64,29 @@ class Frame(eqx.Module):
 
 def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
     """Gather the geometry of a formation (or of any list of link, kind, feature)."""
-    finger = jax.nn.one_hot(formation.link - 1, 2, dtype=body.mass.dtype)
-    palm = formation.link == 0
+    of_finger = jax.nn.one_hot(formation.link - 1, 2, dtype=body.mass.dtype)
+    finger = jnp.where((formation.kind == PALM_END)[:, None], 0.0, of_finger)  # which turns with no finger
+    palm, corner = formation.link == 0, formation.kind >= ROOT
     on_link = formation.kind == VERTEX
     start = body.vertices[formation.feature]
     end = body.vertices[next_vertex(body.count, body.vertices.shape[0])[formation.feature]]
     # A padded edge has no length: give it one before dividing, so that its (unused) derivative stays finite.
     extent = jnp.where(jnp.all(start == end, axis=1)[:, None], jnp.ones_like(start), end - start)
     length = jnp.sqrt((extent**2).sum(1))
+    along_palm = np.array([1.0, 0.0])  # which ends beside the fingers' joints, these wherever they are
     palm_lower, palm_upper = hand.joint[1, 0], hand.joint[0, 0]
     reach = finger @ hand.length
     return Contacts(
         on_link=on_link,
         finger=finger,
         side=jnp.where(formation.link == 2, -1.0, 1.0).astype(body.mass.dtype),
-        joint=finger @ hand.joint,
-        reach=reach,
+        joint=of_finger @ hand.joint * jnp.where((formation.kind == PALM_END)[:, None], along_palm, 1.0),
+        reach=jnp.where(corner, 0.0, reach),
         offset=finger @ hand.offset,
         point=start,
         edge=extent / length[:, None],
-        lower=jnp.where(on_link & palm, palm_lower, 0.0),
-        upper=jnp.where(on_link, jnp.where(palm, palm_upper, reach), length),
+        lower=jnp.where(on_link & palm, palm_lower, jnp.where(corner, CORNER, 0.0)),
+        upper=jnp.where(on_link, jnp.where(palm, palm_upper, reach), length - jnp.where(corner, CORNER, 0.0)),
         friction=body.friction[formation.link],
         tangential=formation.tangential,
         slides=~formation.tangential & ~jnp.roll(formation.tangential, -1),
@@ -99,6 +105,13 @@ def every_contact(capacity: int) -> Formation:
     link = jnp.concatenate([jnp.full(capacity, k) for k in (0, 1, 2, 1, 2)])
     kind = jnp.repeat(jnp.asarray([VERTEX, VERTEX, VERTEX, EDGE, EDGE]), capacity)
     return Formation(link, kind, jnp.tile(number, 5), jnp.zeros(5 * capacity, bool))
+
+
+def obstacles(capacity: int) -> Formation:
+    """Each finger's root and each end of the palm on each edge (`4 * capacity` rows): what the object cannot pass."""
+    link = jnp.repeat(jnp.asarray([1, 2, 1, 2]), capacity)
+    kind = jnp.repeat(jnp.asarray([ROOT, ROOT, PALM_END, PALM_END]), capacity)
+    return Formation(link, kind, jnp.tile(jnp.arange(capacity), 4), jnp.zeros(4 * capacity, bool))
 
 
 @jax.jit

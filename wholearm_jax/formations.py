@@ -78,7 +78,8 @@ def touching(scene: Scene, z: Float[Array, "5"]) -> tuple[str, ...]:
 def _near(scene, z, pairs):
     solid = body(scene.object)
     mechanics = system(solid, scene.hand, scene.gravity, jax.tree.map(lambda a: a[:4], pairs))
-    at, held = frames(mechanics.candidates, z / mechanics.configuration_unit), mechanics.candidates
+    held = jax.tree.map(lambda a: a[: pairs.link.shape[0]], mechanics.candidates)
+    at = frames(held, z / mechanics.configuration_unit)
     slack = TOUCHING
     inside = (at.along >= held.lower - slack) & (at.along <= held.upper + slack)
     return inside & (jnp.abs(at.gap) < TOUCHING) & (pairs.feature < solid.count)

@@ -126,6 +126,9 @@ def ending(traced: Traced, phase: Phase, capacity: int) -> str:
     why, index = int(traced.wire.end_why), int(traced.wire.end_contact)
     if why == MADE:
         group, feature = divmod(index, capacity)
+        if group >= 5:
+            corner = ("finger1's root", "finger2's root", "the palm's end at finger1", "the palm's end at finger2")
+            return f"e{feature} meets {corner[group - 5]}"
         link, kind = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1))[group]
         return f"{contact_name(link, kind, feature)} is made"
     if why == LEFT:

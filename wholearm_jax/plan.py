@@ -6,6 +6,7 @@ planned end.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -14,14 +15,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from wholearm_jax.phase import Outcome, Traced, destination, prepare, run, start_configuration
+from wholearm_jax.phase import Outcome, Traced, destination, end_configuration, prepare, run, start_configuration
 from wholearm_jax.precision import digits, require_x64
 from wholearm_jax.result import Result, describe
-from wholearm_jax.scene import Phase, Scene, body
+from wholearm_jax.scene import Body, Phase, Scene, body
 from wholearm_jax.schedule import Torque, has_steps, padded
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
-from wholearm_jax.verdict import ARRIVAL
+from wholearm_jax.verdict import ARRIVAL, GOALS
 from wholearm_jax.wire import Resolution
 
 ROUNDING = 1e4  # of a precision's last digit, the interpolation error that more panels do not make smaller
@@ -43,15 +44,53 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     >>> print(f"{float(traced[0].table.length):.2f} object radii")
     1.33 object radii
     """
+    if _transformed(scene):  # shapes are fixed there: the caller has chosen the resolution
+        return _apart(_traced_together(scene, resolution), len(scene.phases))
     solid, rough, found = body(scene.object), scene.start, []
     for phase in scene.phases:
         traced = _refined(solid, scene, phase, rough, resolution, tolerance)
-        if phase.arrive == "hold" and _concrete(traced.table.status) and int(traced.table.status) != Status.OK:
+        if phase.arrive == "hold" and int(traced.table.status) != Status.OK:
             other = eqx.tree_at(lambda p: p.heading.sign, phase, -phase.heading.sign)
             traced = _refined(solid, scene, other, rough, resolution, tolerance)
         found.append(joined(traced, rough) if found else traced)
         rough = destination(phase, traced)
     return tuple(found)
+
+
+@eqx.filter_jit
+def _traced_together(scene: Scene, resolution: Resolution) -> Traced:
+    """Every phase of a plan in one program: `Traced` with an axis of phases."""
+    on = partial(trace_next, scene, body(scene.object), resolution)
+    return jax.lax.scan(on, trace_first(scene), stacked([trace_told(p) for p in scene.phases]))[1]
+
+
+def trace_first(scene: Scene):
+    """Where a plan begins, and that it does: what `trace_next` needs of the phases before."""
+    return scene.start, jnp.asarray(True)
+
+
+def trace_told(phase: Phase):
+    """What a plan says of a phase's wire."""
+    return phase.formation, phase.heading, jnp.asarray(phase.arrive == "hold")
+
+
+def trace_next(scene: Scene, solid: Body, resolution: Resolution, at, phase):
+    """Trace the next phase of a plan, from where the one before it ended: one step of a scan."""
+    (rough, first), (formation, heading, holds) = at, phase
+    alone = prepare(solid, scene.hand, scene.gravity, formation, rough, heading, resolution)
+    traced = jax.tree.map(lambda a, b: jnp.where(first, a, b), alone, joined(alone, rough))
+    ends = jnp.where(holds, start_configuration(traced.table), end_configuration(traced))
+    return (ends, jnp.asarray(False)), traced
+
+
+def stacked(several):
+    """Trees of one kind as one with a leading axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
+
+
+def _apart(together, count: int) -> tuple:
+    """The `count` trees that are stacked in one."""
+    return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], together) for k in range(count))
 
 
 @jax.jit
@@ -63,21 +102,15 @@ def joined(traced: Traced, rough) -> Traced:
     return eqx.tree_at(lambda t: t.table.status, traced, jnp.where(open_there, int(Status.NO_CONVERGENCE), status))
 
 
-def _concrete(value) -> bool:
-    """Whether an array holds numbers now, rather than standing for them in a transformation."""
-    try:
-        float(value)
-    except jax.errors.ConcretizationTypeError:
-        return False
-    return True
+def _transformed(*trees) -> bool:
+    """Whether arrays stand for numbers in a transformation, rather than holding them."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, tolerance: float) -> Traced:
     while True:
         traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, resolution)
         table = traced.table
-        if not _concrete(table.error):
-            return traced  # under a transformation shapes are fixed: the caller has chosen the resolution
         least_error = ROUNDING * jnp.finfo(table.breaks.dtype).eps
         coarse = bool(table.error > max(tolerance, least_error)) and int(table.status) == Status.OK
         full = int(table.count) >= resolution.pieces
@@ -95,17 +128,41 @@ def outcomes(
     scene: Scene, torque: Torque, traced: tuple[Traced, ...], how: Integration, arrival: float = ARRIVAL
 ) -> tuple[Outcome, ...]:
     """Simulate every phase; differentiable, and usable under any JAX transformation."""
-    zero = jnp.zeros((), torque.times.dtype)
-    schedule, start, planned, still, found = padded(torque), zero, zero, jnp.zeros(5, zero.dtype), []
-    arriving = still
-    for phase, at in zip(scene.phases, traced, strict=True):
-        planned = planned + phase.duration
-        one = run(at.table, schedule, start, planned - start, how, phase.arrive, arriving, arrival)
-        found.append(one)
-        flying = phase.arrive == "moving"
-        start = start + one.duration * one.motion.share[one.motion.count] if flying else planned
-        arriving = one.leaving if flying else still
+    alike = len({tuple(leaf.shape for leaf in jax.tree.leaves(one)) for one in traced}) == 1
+    if alike and _transformed(scene, torque, traced):
+        phases = stacked([(at.table, *simulate_told(phase)) for at, phase in zip(traced, scene.phases, strict=True)])
+        return _apart(_outcomes_together(phases, padded(torque), how, arrival), len(traced))
+    at, found, schedule = simulate_first(torque), [], padded(torque)
+    for phase, one in zip(scene.phases, traced, strict=True):
+        at, outcome = simulate_next(schedule, how, arrival, at, (one.table, *simulate_told(phase)))
+        found.append(outcome)
     return tuple(found)
+
+
+@eqx.filter_jit
+def _outcomes_together(phases, schedule: Torque, how: Integration, arrival) -> Outcome:
+    """Every phase of a plan in one program: `Outcome` with an axis of phases."""
+    return jax.lax.scan(partial(simulate_next, schedule, how, arrival), simulate_first(schedule), phases)[1]
+
+
+def simulate_first(torque: Torque):
+    """When a plan begins, when it should, and at which `z_dot`: what `simulate_next` needs of the phases before."""
+    zero = jnp.zeros((), torque.times.dtype)
+    return zero, zero, jnp.zeros(5, zero.dtype)
+
+
+def simulate_told(phase: Phase):
+    """What a plan says of a phase's motion: its duration, its goal, and whether the next takes over at speed."""
+    return phase.duration, jnp.asarray(GOALS[phase.arrive]), jnp.asarray(phase.arrive == "moving")
+
+
+def simulate_next(schedule: Torque, how: Integration, arrival, at, phase):
+    """Simulate the next phase of a plan, from when the one before it ended: one step of a scan."""
+    (start, planned, arriving), (table, duration, goal, passes) = at, phase
+    planned = planned + duration
+    one = run(table, schedule, start, planned - start, how, goal, arriving, arrival)
+    ended = start + one.duration * one.motion.share[one.motion.count]
+    return (jnp.where(passes, ended, planned), planned, jnp.where(passes, one.leaving, 0.0)), one
 
 
 def margin(
@@ -195,8 +252,7 @@ def simulate(
 def steps_within(scenes: Scene, torque: Torque) -> bool:
     """Whether a schedule steps within a phase of a scene, or of one of stacked scenes; times and durations that are
     being transformed count as they do not."""
-    times = [torque.times, *(phase.duration for phase in scenes.phases)]
-    if any(isinstance(one, Tracer) for one in times):
+    if _transformed(torque.times, [phase.duration for phase in scenes.phases]):
         return False
     ends = np.cumsum([np.asarray(phase.duration) for phase in scenes.phases], axis=0)
     first = 0.0

@@ -3,9 +3,9 @@
 Derivation: section 3 of `docs/derivation.md`.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax import stop_gradient
 
 from wholearm_jax.contacts import constraint_rows, constraints, frames
@@ -37,7 +37,8 @@ def project(system, rough):
 
 
 def misplaced(system, z):
-    """Whether a contact lies beyond its feature, a vertex behind the palm, or a convex object on a finger or behind it.
+    """Whether a contact lies beyond its feature, a vertex behind the palm, a link within the object, or a convex object
+    behind a finger that holds it.
 
     Behind a finger's line, vertices of a convex object may lie where the finger's tip touches an edge, not where a
     vertex touches the finger.
@@ -49,25 +50,33 @@ def misplaced(system, z):
     of_finger, held_by = system.candidates.finger > 0, (system.contacts.finger > 0) & system.contacts.on_link[:, None]
     faces = ~of_finger.any(1) | (system.convex & (of_finger & held_by.any(0)).any(1))  # in front of them all must be
     behind = system.watched & system.candidates.on_link & faces & inside & (pairs.gap < -tolerance)
-    return jnp.any(beyond) | jnp.any(behind) | (system.convex & _pierced(system, z, pairs.gap, tolerance))
+    return jnp.any(beyond) | jnp.any(behind) | _pierced(system, pairs, tolerance)
 
 
-def _pierced(system, z, tip, tolerance):
-    """Whether part of a finger's contact edge lies within a convex object: behind all of its edges."""
-    several = system.candidates
-    root = frames(eqx.tree_at(lambda c: c.reach, several, jnp.zeros_like(several.reach)), z).gap
-    root, rise = root + tolerance, tip - root
-    cross = -root / jnp.where(rise == 0, 1.0, rise)  # where, from root (0) to tip (1), an edge's line is crossed
-    enter = jnp.where(rise < 0, cross, jnp.where((rise == 0) & (root > 0), jnp.inf, -jnp.inf))
-    leave = jnp.where(rise > 0, cross, jnp.inf)
+def _pierced(system, pairs, tolerance):
+    """Whether part of a finger's contact edge or of the palm lies within the object.
 
-    def within(finger):
-        edges = ~several.on_link & (several.finger[:, finger] > 0) & system.real
-        first = jnp.where(edges, enter, -jnp.inf).max()
-        last = jnp.where(edges, leave, jnp.inf).min()
-        return jnp.minimum(last, 1.0) > jnp.maximum(first, 0.0)
+    Edges of the object cut each link into parts, and the middle of one lies within where edges stand round about it:
+    seen from there they turn by a whole circle. Gaps and places along edges are linear on a link.
+    """
+    gap, along, upper, real = (a.reshape(9, -1) for a in (pairs.gap, pairs.along, system.candidates.upper, system.real))
+    begin, end = np.array([5, 6, 7]), np.array([3, 4, 8])  # root to tip, root to tip, one end of the palm to the other
 
-    return within(0) | within(1)
+    def on(values, share):
+        return values[begin][:, None] + share[..., None] * (values[end] - values[begin])[:, None]
+
+    upper, real = upper[3], real[3]  # the first row for tips on edges
+    across = gap[begin] - gap[end]
+    share = gap[begin] / jnp.where(across == 0, 1.0, across)
+    cut = real & (across != 0) & (share > 0) & (share < 1)
+    ends = jnp.zeros((3, 1), share.dtype)
+    stops = jnp.sort(jnp.concatenate([ends, jnp.where(cut, share, 1.0), ends + 1.0], axis=1), axis=1)
+    middle = (stops[:, 1:] + stops[:, :-1]) / 2
+    gap, along = on(gap, middle), on(along, middle)
+    beside = real & (jnp.abs(gap) < tolerance) & (along > -tolerance) & (along < upper + tolerance)
+    below = jnp.where(gap == 0, 1.0, -gap)
+    turned = jnp.where(real, jnp.arctan(along / below) + jnp.arctan((upper - along) / below), 0.0).sum(-1)
+    return jnp.any((turned > jnp.pi) & ~beside.any(-1))
 
 
 def dependent(system, z):
