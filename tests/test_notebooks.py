@@ -1,9 +1,9 @@
 """Notebooks: each runs from its question to its figure without a complaint, and its kept outputs are small."""
 
-import os
 import re
 from pathlib import Path
 
+import jax
 import nbclient
 import nbformat
 import pytest
@@ -14,15 +14,12 @@ LARGEST = 500_000  # bytes of a notebook with its outputs
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compiled(tmp_path_factory):
-    """Kernels share compiled programs, of all workers, unless the environment says where they are kept already."""
+def compiled():
+    """Kernels share the tests' compiled programs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("MPLBACKEND", raising=False)  # the command line's choice, once a test has run it in this process
-        if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-            base = tmp_path_factory.getbasetemp()
-            shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "compiled"
-            patch.setenv("JAX_COMPILATION_CACHE_DIR", str(shared))
-            patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", jax.config.values["jax_compilation_cache_dir"])
+        patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
         yield
 
 

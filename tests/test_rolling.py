@@ -280,7 +280,7 @@ def test_gradients():
     data["phase"][0]["duration"] = 0.6
     scene = wholearm_jax.parse(data)
     even = wholearm_jax.quasistatic(scene)
-    assert_modes_and_differences_agree(scene, Torque(1.01 * even.times, 1.01 * even.values))
+    assert_modes_and_differences_agree(scene, Torque(1.01 * even.times, 1.01 * even.values), seed=5)
 
 
 def test_mirror_image():

@@ -115,10 +115,10 @@ def test_derivatives_pass_from_chart_to_chart():
 
     value, slope = jax.jvp(outcome, (jnp.asarray(0.0),), (jnp.asarray(1.0),))
     assert 0.5 < float(value[5]) < 1.0, "it does not arrive"
-    assert np.abs(slope).min() > 1e-3
+    assert (np.abs(slope) > 1e-3).sum() >= 4  # it ends flush with the palm, which fixes y, phi and one finger
     for k in range(len(slope)):
         numeric = nearest_difference(lambda h, k=k: float(outcome(jnp.asarray(h))[k]), float(slope[k]))
-        assert float(slope[k]) == pytest.approx(numeric, rel=1e-6)
+        assert float(slope[k]) == pytest.approx(numeric, rel=1e-6, abs=1e-9)
 
 
 def test_a_wire_that_meets_another_is_singular():
