@@ -1,6 +1,5 @@
 """Every test computes in 64 bits, compiles as the command line does, and leaves room for those that follow."""
 
-import os
 import sys
 from pathlib import Path
 
@@ -13,9 +12,6 @@ MAPPED = 30_000  # half of the memory areas that Linux grants a process by defau
 
 jax.config.update("jax_enable_x64", True)
 command.compile_quickly()
-if "xla_cpu_use_fusion_emitters" in os.environ.get("XLA_FLAGS", ""):
-    # Workers fill all processors: a program compiled in one piece takes a little less of them than one in many.
-    os.environ["XLA_FLAGS"] += " --xla_cpu_parallel_codegen_split_count=1"
 
 
 def pytest_collection_modifyitems(items):

@@ -17,7 +17,7 @@ from wholearm_jax.batch import Checked
 from wholearm_jax.store import TYPES, StoreError, identity, open_store
 
 zarr = pytest.importorskip("zarr")
-COUNT, CHUNK, KILLS = 6, 1, 3
+COUNT, CHUNK, KILLS = 6, 1, 2
 
 
 @pytest.fixture(scope="module")
