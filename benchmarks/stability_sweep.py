@@ -117,10 +117,7 @@ def blank(scenes: Scenes):
     whole = ("status", "table_status", "reason", "violations", "level", "steps", "wire_end", "pieces")
     real = ("margin", "scale", "condition", "table_error", "length", "travel", "end_share", *RESIDUALS, *EXCESSES)
     found = {name: np.zeros(n, int) for name in whole} | {name: np.full(n, np.nan) for name in real}
-    found |= {"torque": np.zeros((n, *scenes.noise.shape[1:]))}
-    found |= {
-        "moved": np.zeros(n, bool),
-    }
+    found |= {"torque": np.zeros((n, *scenes.noise.shape[1:])), "moved": np.zeros(n, bool)}
     return found | {"family": scenes.family, "exact": scenes.exact, "at_rest": scenes.at_rest}
 
 

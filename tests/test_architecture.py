@@ -14,7 +14,7 @@ ORDER = (
     *("march", "start", "places", "wire", "reduction"),
     *("schedule", "stepping", "landing", "motion", "forces", "verdict", "holding"),
     *("phase", "result", "sampling", "plan", "gradient", "gradient_check"),
-    *("squeeze", "shooting", "descent", "formations", "guesses", "optimiser", "baseline"),
+    *("squeeze", "shooting", "linearisation", "descent", "formations", "guesses", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),
     *("free_bodies", "execution", "perturbation"),
     *("scene_file", "result_file", "store", "polygon_file", "palette", "report"),

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.descent import Limits, moved
+from wholearm_jax.descent import moved
+from wholearm_jax.linearisation import Limits
 from wholearm_jax.motion import move
 from wholearm_jax.plan import trace
 from wholearm_jax.schedule import window

@@ -3,6 +3,7 @@
 What takes long to import is imported where it is used: a command that needs none of it starts at once.
 """
 
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -105,15 +106,22 @@ def predicted(scene, schedule, torque: Path, tolerance: float, traced):
         raise BadInput(f"{torque}: {error}") from None
 
 
+@contextmanager
+def writing(where: str):
+    """Say in one line that a place cannot be written to."""
+    try:
+        yield
+    except OSError as error:
+        raise BadInput(f"{where}: cannot be written: {error.strerror}") from None
+
+
 def made_folder(out: Path | None) -> Path | None:
     """Make the output folder now, so that a long computation is not lost to a folder that cannot be written."""
     if out is None:
         return None
-    try:
+    with writing(f"--out {out}"):
         out.mkdir(parents=True, exist_ok=True)
         probe = out / ".wholearm"
         probe.write_text("")
         probe.unlink()
-    except OSError as error:
-        raise BadInput(f"--out {out}: cannot be written: {error.strerror}") from None
     return out

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import typer
 
-from wholearm_jax.arguments import BadInput, SceneName, TorqueFile
+from wholearm_jax.arguments import BadInput, SceneName, TorqueFile, writing
 
 ARRIVAL = 0.01  # share of the wire: perturbed plans cannot end where an unperturbed one must
 Vary = Annotated[list[str] | None, typer.Option("--vary", help="QUANTITY=AMOUNT, e.g. vertices=0.0005, friction=20%.")]
@@ -130,10 +130,8 @@ def optimise_robustly(varied, folder: Path | None, samples: int, knots: int, ste
         told = (f"{100 * h.share:.1f} % hold, worst margin {h.margin:.4g} N" for h in (nominal, robust))
         print(f"{samples} {name} scenes: nominal {next(told)}; robust {next(told)}")
     if folder is not None:
-        try:
+        with writing(f"--out {folder}"):
             write_torque(found.torque, folder / "torque.csv")
-        except OSError as error:
-            raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
     sys.exit(0 if found.unseen[1].share == 1.0 else 1)
 
 
@@ -265,9 +263,7 @@ def _report(store, scene, source, out: Path):
         shown = tuple((source.parameters[k], shifts[:, k]) for k in most_influential(source.parameters, influence))
         pairs = zip(source.parameters, influence.tolist(), strict=True)
         more = {"influence": {name: rank for name, rank in pairs if rank}}
-    try:
+    with writing(str(out)):
         write_whole(out.with_suffix(".json"), json.dumps(told.as_dict() | more, indent=1) + "\n")
         save_figure(lambda: draw_survey(told, more.get("influence"), shown), out.parent, out.stem)
-    except OSError as error:
-        raise BadInput(f"{out}: cannot be written: {error.strerror}") from None
     return told

@@ -22,6 +22,7 @@ from wholearm_jax.arguments import (
     predicted,
     scene_of,
     traced_or_refused,
+    writing,
 )
 from wholearm_jax.batch_command import ARRIVAL, check, ensemble, optimise_robustly
 from wholearm_jax.execution_command import execute
@@ -267,10 +268,8 @@ def report(
 ) -> None:
     """Write a result folder's report: one page with an animation, plots and tables, for any browser, offline."""
     path = out or folder / "report.html"
-    try:
+    with writing(str(path)):
         _write_report(folder, path)
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
     print(path)
 
 
@@ -282,15 +281,13 @@ def _finish(result, folder: Path | None, samples: int, report: bool = False, **m
     if folder is not None:
         from wholearm_jax.result_file import summary, write_summary, write_torque, write_trajectory
 
-        try:
+        with writing(f"--out {folder}"):
             write_torque(result.torque, folder / "torque.csv")
             write_trajectory(result, folder / "trajectory.csv", samples)
             write_summary(summary(result, **more), folder / "summary.json")
             _draw(result, folder)
             if report:
                 _write_report(folder, folder / "report.html")
-        except OSError as error:
-            raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
     print(result.message if not folder else f"{result.message} -> {folder}")
     sys.exit(0 if result.status.value == 0 else 1)
 

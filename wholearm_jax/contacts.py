@@ -27,6 +27,12 @@ from wholearm_jax.scene import EDGE, VERTEX, Body, Formation, Hand, next_vertex
 
 ROOT, PALM_END = 2, 3  # corners that no formation holds, at an edge of the object: where a finger or the palm begins
 CORNER = 1e-6  # length units of an edge beside its ends at which it is a vertex of the object that meets such a corner
+GROUPS = (
+    *((0, VERTEX), (1, VERTEX), (2, VERTEX), (1, EDGE), (2, EDGE)),
+    *((1, ROOT), (2, ROOT), (1, PALM_END), (2, PALM_END)),
+)
+"""Link (of the palm's ends: the finger beside it) and kind of all that may meet, each with every feature in turn."""
+HELD = 5  # of these groups are contacts that a formation may hold
 
 
 class Contacts(eqx.Module):
@@ -65,8 +71,10 @@ class Frame(eqx.Module):
 def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
     """Gather the geometry of a formation (or of any list of link, kind, feature)."""
     of_finger = jax.nn.one_hot(formation.link - 1, 2, dtype=body.mass.dtype)
-    finger = jnp.where((formation.kind == PALM_END)[:, None], 0.0, of_finger)  # which turns with no finger
+    of_palm = (formation.kind == PALM_END)[:, None]
+    finger = jnp.where(of_palm, 0.0, of_finger)  # the palm's end turns with no finger
     palm, corner = formation.link == 0, formation.kind >= ROOT
+    beside = jnp.where(corner, CORNER, 0.0)
     on_link = formation.kind == VERTEX
     start = body.vertices[formation.feature]
     end = body.vertices[next_vertex(body.count, body.vertices.shape[0])[formation.feature]]
@@ -80,13 +88,13 @@ def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
         on_link=on_link,
         finger=finger,
         side=jnp.where(formation.link == 2, -1.0, 1.0).astype(body.mass.dtype),
-        joint=of_finger @ hand.joint * jnp.where((formation.kind == PALM_END)[:, None], along_palm, 1.0),
+        joint=of_finger @ hand.joint * jnp.where(of_palm, along_palm, 1.0),
         reach=jnp.where(corner, 0.0, reach),
         offset=finger @ hand.offset,
         point=start,
         edge=extent / length[:, None],
-        lower=jnp.where(on_link & palm, palm_lower, jnp.where(corner, CORNER, 0.0)),
-        upper=jnp.where(on_link, jnp.where(palm, palm_upper, reach), length - jnp.where(corner, CORNER, 0.0)),
+        lower=jnp.where(on_link & palm, palm_lower, beside),
+        upper=jnp.where(on_link, jnp.where(palm, palm_upper, reach), length - beside),
         friction=body.friction[formation.link],
         tangential=formation.tangential,
         slides=~formation.tangential & ~jnp.roll(formation.tangential, -1),
@@ -101,17 +109,18 @@ def placed(several: Contacts, z: Float[Array, "5"]) -> Contacts:
 
 def every_contact(capacity: int) -> Formation:
     """All pairs that may touch: each vertex on each link, each fingertip on each edge (`5 * capacity` rows)."""
-    number = jnp.arange(capacity)
-    link = jnp.concatenate([jnp.full(capacity, k) for k in (0, 1, 2, 1, 2)])
-    kind = jnp.repeat(jnp.asarray([VERTEX, VERTEX, VERTEX, EDGE, EDGE]), capacity)
-    return Formation(link, kind, jnp.tile(number, 5), jnp.zeros(5 * capacity, bool))
+    return _on_features(GROUPS[:HELD], capacity)
 
 
-def obstacles(capacity: int) -> Formation:
-    """Each finger's root and each end of the palm on each edge (`4 * capacity` rows): what the object cannot pass."""
-    link = jnp.repeat(jnp.asarray([1, 2, 1, 2]), capacity)
-    kind = jnp.repeat(jnp.asarray([ROOT, ROOT, PALM_END, PALM_END]), capacity)
-    return Formation(link, kind, jnp.tile(jnp.arange(capacity), 4), jnp.zeros(4 * capacity, bool))
+def every_meeting(capacity: int) -> Formation:
+    """The same, then each finger's root and each end of the palm on each edge, which stop the object: all `GROUPS`."""
+    return _on_features(GROUPS, capacity)
+
+
+def _on_features(groups, capacity: int) -> Formation:
+    link, kind = (jnp.repeat(jnp.asarray(column), capacity) for column in zip(*groups, strict=True))
+    rows = len(groups) * capacity
+    return Formation(link, kind, jnp.tile(jnp.arange(capacity), len(groups)), jnp.zeros(rows, bool))
 
 
 @jax.jit

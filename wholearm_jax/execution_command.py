@@ -6,7 +6,16 @@ from typing import Annotated
 
 import typer
 
-from wholearm_jax.arguments import BadInput, SceneName, TorqueFile, made_folder, predicted, scene_of, traced_or_refused
+from wholearm_jax.arguments import (
+    BadInput,
+    SceneName,
+    TorqueFile,
+    made_folder,
+    predicted,
+    scene_of,
+    traced_or_refused,
+    writing,
+)
 
 
 def execute(
@@ -79,13 +88,11 @@ def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> Non
     from wholearm_jax.result_file import execution_summary, write_execution, write_summary
     from wholearm_jax.writing import write_whole
 
-    try:
+    with writing(f"--out {folder}"):
         write_summary(execution_summary(done, many, torque=str(torque)), folder / "execution.json")
         write_execution(done, folder / "execution.csv")
         write_whole(folder / "model.xml", done.model_xml)
         _draw_execution(done, folder, video)
-    except OSError as error:
-        raise BadInput(f"--out {folder}: cannot be written: {error.strerror}") from None
 
 
 def _draw_execution(done, folder: Path, video: bool) -> None:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from wholearm_jax.descent import passed_on
+from wholearm_jax.linearisation import passed_on
 from wholearm_jax.phase import Traced
 from wholearm_jax.programs import Program
 from wholearm_jax.shooting import Variables

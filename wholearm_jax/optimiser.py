@@ -18,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.descent import COLDEST, JOINED, Limits, advance, begin, interior_point, projected
+from wholearm_jax.descent import COLDEST, JOINED, advance, begin, interior_point, projected
 from wholearm_jax.guesses import guesses
+from wholearm_jax.linearisation import Limits
 from wholearm_jax.phase import Traced, balance_at_start, run
-from wholearm_jax.plan import outcomes, trace
+from wholearm_jax.plan import outcomes, stacked, trace
 from wholearm_jax.precision import require_x64
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import blank
@@ -341,9 +342,7 @@ def _evenly(duration, values) -> Torque:
     return Torque(jnp.asarray(np.linspace(0.0, float(duration), len(values))), jnp.asarray(values))
 
 
-@jax.jit
-def _stacked(tables):
-    return jax.tree.map(lambda *a: jnp.stack(a), *tables)
+_stacked = jax.jit(stacked)
 
 
 def _schedules(task: _Task, p: Variables) -> list[Torque]:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from wholearm_jax.contacts import GROUPS, PALM_END, ROOT
 from wholearm_jax.forces import Score, score
 from wholearm_jax.holding import Departure, Statics, statics
 from wholearm_jax.motion import Motion, move
@@ -126,10 +127,11 @@ def ending(traced: Traced, phase: Phase, capacity: int) -> str:
     why, index = int(traced.wire.end_why), int(traced.wire.end_contact)
     if why == MADE:
         group, feature = divmod(index, capacity)
-        if group >= 5:
-            corner = ("finger1's root", "finger2's root", "the palm's end at finger1", "the palm's end at finger2")
-            return f"e{feature} meets {corner[group - 5]}"
-        link, kind = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1))[group]
+        link, kind = GROUPS[group]
+        if kind == ROOT:
+            return f"e{feature} meets finger{link}'s root"
+        if kind == PALM_END:
+            return f"e{feature} meets the palm's end at finger{link}"
         return f"{contact_name(link, kind, feature)} is made"
     if why == LEFT:
         return f"{phase.formation.names[phase.formation.contact_of_slot[index]]} leaves its feature"

@@ -12,11 +12,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from wholearm_jax.phase import Outcome, Traced, destination, end_configuration, prepare, run, start_configuration
 from wholearm_jax.precision import digits, require_x64
+from wholearm_jax.programs import transformed
 from wholearm_jax.result import Result, describe
 from wholearm_jax.scene import Body, Phase, Scene, body
 from wholearm_jax.schedule import Torque, has_steps, padded
@@ -44,7 +44,7 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     >>> print(f"{float(traced[0].table.length):.2f} object radii")
     1.33 object radii
     """
-    if _transformed(scene):  # shapes are fixed there: the caller has chosen the resolution
+    if transformed(scene):  # shapes are fixed there: the caller has chosen the resolution
         return _apart(_traced_together(scene, resolution), len(scene.phases))
     solid, rough, found = body(scene.object), scene.start, []
     for phase in scene.phases:
@@ -102,11 +102,6 @@ def joined(traced: Traced, rough) -> Traced:
     return eqx.tree_at(lambda t: t.table.status, traced, jnp.where(open_there, int(Status.NO_CONVERGENCE), status))
 
 
-def _transformed(*trees) -> bool:
-    """Whether arrays stand for numbers in a transformation, rather than holding them."""
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
-
-
 def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, tolerance: float) -> Traced:
     while True:
         traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, resolution)
@@ -129,7 +124,7 @@ def outcomes(
 ) -> tuple[Outcome, ...]:
     """Simulate every phase; differentiable, and usable under any JAX transformation."""
     alike = len({tuple(leaf.shape for leaf in jax.tree.leaves(one)) for one in traced}) == 1
-    if alike and _transformed(scene, torque, traced):
+    if alike and transformed(scene, torque, traced):
         phases = stacked([(at.table, *simulate_told(phase)) for at, phase in zip(traced, scene.phases, strict=True)])
         return _apart(_outcomes_together(phases, padded(torque), how, arrival), len(traced))
     at, found, schedule = simulate_first(torque), [], padded(torque)
@@ -252,7 +247,7 @@ def simulate(
 def steps_within(scenes: Scene, torque: Torque) -> bool:
     """Whether a schedule steps within a phase of a scene, or of one of stacked scenes; times and durations that are
     being transformed count as they do not."""
-    if _transformed(torque.times, [phase.duration for phase in scenes.phases]):
+    if transformed(torque.times, [phase.duration for phase in scenes.phases]):
         return False
     ends = np.cumsum([np.asarray(phase.duration) for phase in scenes.phases], axis=0)
     first = 0.0

@@ -52,7 +52,7 @@ class Program:
             return self.plain(*args)
         arrays, static = eqx.partition(args, _is_array)
         leaves, tree = jax.tree.flatten(arrays)
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        if transformed(leaves):
             return self.plain(*args)
         settings = jax.tree.leaves(static)
         shapes = tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
@@ -99,6 +99,11 @@ def _callable(program: export.Exported, shape) -> Callable:
     # Compiled ahead: `jit` would compile again where a constant's type is weak.
     compiled = jax.jit(program.call).lower(*program.in_avals).compile()
     return lambda *leaves: jax.tree.map(compiled(*leaves).__getitem__, shape)
+
+
+def transformed(*trees) -> bool:
+    """Whether arrays stand for numbers in a transformation, rather than holding them."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def _is_array(leaf) -> bool:

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
 
-from wholearm_jax.contacts import constraint_rows, constraints, frames
+from wholearm_jax.contacts import GROUPS, PALM_END, ROOT, constraint_rows, constraints, frames
 from wholearm_jax.elimination import inverse, solve, times
 from wholearm_jax.march import tangent
 from wholearm_jax.newton import newton
 from wholearm_jax.precision import digits
+from wholearm_jax.scene import EDGE
 
 
 def project(system, rough):
@@ -53,19 +54,25 @@ def misplaced(system, z):
     return jnp.any(beyond) | jnp.any(behind) | _pierced(system, pairs, tolerance)
 
 
+# Where each link begins and ends: both fingers from root to tip, the palm from one end to the other.
+_ENDS = (((1, ROOT), (1, EDGE)), ((2, ROOT), (2, EDGE)), ((1, PALM_END), (2, PALM_END)))
+_LINKS = np.array([[GROUPS.index(end) for end in link] for link in _ENDS]).T
+
+
 def _pierced(system, pairs, tolerance):
     """Whether part of a finger's contact edge or of the palm lies within the object.
 
     Edges of the object cut each link into parts, and the middle of one lies within where edges stand round about it:
     seen from there they turn by a whole circle. Gaps and places along edges are linear on a link.
     """
-    gap, along, upper, real = (a.reshape(9, -1) for a in (pairs.gap, pairs.along, system.candidates.upper, system.real))
-    begin, end = np.array([5, 6, 7]), np.array([3, 4, 8])  # root to tip, root to tip, one end of the palm to the other
+    grouped = (pairs.gap, pairs.along, system.candidates.upper, system.real)
+    gap, along, upper, real = (a.reshape(len(GROUPS), -1) for a in grouped)
+    begin, end = _LINKS
 
     def on(values, share):
         return values[begin][:, None] + share[..., None] * (values[end] - values[begin])[:, None]
 
-    upper, real = upper[3], real[3]  # the first row for tips on edges
+    upper, real = upper[end[0]], real[end[0]]  # the edges' own, whatever is on them
     across = gap[begin] - gap[end]
     share = gap[begin] / jnp.where(across == 0, 1.0, across)
     cut = real & (across != 0) & (share > 0) & (share < 1)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from wholearm_jax.contacts import Contacts, contacts, every_contact, obstacles
+from wholearm_jax.contacts import Contacts, contacts, every_meeting
 from wholearm_jax.scene import EDGE, Body, Formation, Hand, next_vertex
 
 
@@ -74,8 +74,7 @@ def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Format
         dry=hand.dry / rotary,
         torque_limit=hand.torque_limit,
     )
-    capacity = body.vertices.shape[0]
-    pairs = jax.tree.map(lambda *parts: jnp.concatenate(parts), every_contact(capacity), obstacles(capacity))
+    pairs = every_meeting(body.vertices.shape[0])
     touchable = pairs.feature < body.count
     heavy = jnp.stack([small_body.mass, small_body.mass, small_body.inertia])
     return System(

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from wholearm_jax.plan import stacked
 from wholearm_jax.scene import COORDINATES, LINKS, Scene
 
 FINGERS = ("finger 1", "finger 2")
@@ -120,7 +121,7 @@ def stack(scenes: Sequence[Scene]) -> Scene:
     alike = [_renamed(_padded(s, capacity), scenes[0]) for s in scenes]
     if len({jax.tree.structure(s) for s in alike}) > 1:
         raise ValueError("stacked scenes need the same phases (number, arrival) and the same optional entries")
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike)
+    return stacked(alike)
 
 
 def _padded(scene: Scene, capacity: int) -> Scene:

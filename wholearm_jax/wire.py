@@ -47,11 +47,25 @@ class Resolution(NamedTuple):
     march: int = 256
 
 
-class Wire(eqx.Module):
-    """A traced wire in object units. Pieces beyond `count` are empty and lie at the wire's end.
+class Pieces(eqx.Module):
+    """The smooth pieces of a wire, and the charts that they lie in. Those beyond `count` are empty and lie at its end.
 
     Piece `k` covers `[breaks[k], breaks[k + 1]]` in the chart `chart[k]` about (`anchor[k]`, `anchor_s[k]`), and
-    `factor[k]` is the ratio of `ds/dt` after entering the piece to that before. `slip_sign` (Xi) and `joint_sign` hold
+    `factor[k]` is the ratio of `ds/dt` after entering the piece to that before.
+    """
+
+    count: Int[Array, ""]
+    breaks: Float[Array, "pieces_1"]
+    chart: Float[Array, "pieces 5"]
+    anchor: Float[Array, "pieces 5"]
+    anchor_s: Float[Array, "pieces"]
+    factor: Float[Array, "pieces"]
+
+
+class Wire(Pieces):
+    """A traced wire in object units: its pieces, their panels and nodes, and how it ends.
+
+    `slip_sign` (Xi) and `joint_sign` hold
     for forward travel. Panels `first[k] ... first[k] + panels[k] - 1` belong to piece `k`; `nodes[p, i]` is `z` at node
     `i` of panel `p`. `end_why` says why the wire ends and `end_contact` which contact is made (a row of
     `System.candidates`) or leaves its feature (a row of `System.contacts`).
@@ -64,12 +78,6 @@ class Wire(eqx.Module):
     end_contact: Int[Array, ""]
     residual: Float[Array, ""]
     start_gaps: Float[Array, "slots"]
-    count: Int[Array, ""]
-    breaks: Float[Array, "pieces_1"]
-    chart: Float[Array, "pieces 5"]
-    anchor: Float[Array, "pieces 5"]
-    anchor_s: Float[Array, "pieces"]
-    factor: Float[Array, "pieces"]
     slip_sign: Float[Array, "pieces slots"]
     joint_sign: Float[Array, "pieces 2"]
     first: Int[Array, "pieces"]
@@ -138,18 +146,7 @@ def chebyshev(nodes: int) -> np.ndarray:
     return -np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)
 
 
-class _Laid(NamedTuple):
-    """Pieces and the charts that they lie in, as in `Wire`."""
-
-    count: Int[Array, ""]
-    breaks: Float[Array, "pieces_1"]
-    chart: Float[Array, "pieces 5"]
-    anchor: Float[Array, "pieces 5"]
-    anchor_s: Float[Array, "pieces"]
-    factor: Float[Array, "pieces"]
-
-
-def _lay(system, marched, places, start, resolution) -> _Laid:
+def _lay(system, marched, places, start, resolution) -> Pieces:
     """Cut the wire into its pieces, each in the chart that it is charted by."""
     inside = jnp.isfinite(places.s) & (stop_gradient(places.s) < stop_gradient(places.end_s))
     count = inside.sum() + 1
@@ -173,7 +170,7 @@ def _lay(system, marched, places, start, resolution) -> _Laid:
     old = marched.charts[before]
     x_entry = jax.vmap(lambda z, u: tangent(system, z, u))(entry, old)
     factor = jnp.where(live, (chart * x_entry).sum(1) / (old * x_entry).sum(1), 1.0)
-    return _Laid(count, breaks, chart, anchor, anchor_s, factor)
+    return Pieces(count, breaks, chart, anchor, anchor_s, factor)
 
 
 def _cut(system, fixed, marched, places, start, resolution):
@@ -216,7 +213,7 @@ def _cut(system, fixed, marched, places, start, resolution):
         panels=panels,
         owner=owner,
         nodes=nodes,
-        **laid._asdict(),
+        **vars(laid),
     )
 
 

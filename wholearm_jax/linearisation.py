@@ -1,0 +1,176 @@
+"""Linearise: all intervals (`shooting`) with first derivatives, what they must respect, and products with those.
+
+Derivation: section 9 of `docs/derivation.md`.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from wholearm_jax.forces import spare
+from wholearm_jax.reduction import Table, change, horner, powers
+from wholearm_jax.shooting import PARTS, ROWS, SAMPLES, STEPS, Variables, local, shoot
+from wholearm_jax.stepping import Integration
+
+
+class Limits(eqx.Module):
+    """What the result must respect: torque rates [N m/s], durations [s], which knots' torques stay as they are; and
+    each phase's `unit` of forces [N]."""
+
+    rate: Float[Array, "2"]
+    shortest: Float[Array, ""]
+    longest: Float[Array, ""]
+    pinned: Bool[Array, "phases knots"]
+    unit: Float[Array, "phases"]
+
+
+class Rooms(NamedTuple):
+    """Of each interval: what must stay positive (forces over the margin, the others over zero), with weights (0: does
+    not exist), and the state in which the interval ends."""
+
+    room: Float[Array, "*intervals rooms"]
+    weight: Float[Array, "*intervals rooms"]
+    end: Float[Array, "*intervals 2"]
+
+
+class Linear(NamedTuple):
+    """All intervals at `p` with derivatives: `at` and `rates` (last axis: an interval's seven numbers), what must
+    vanish, `defect`, and its derivatives `across`; `loose` marks rows of them that do not bind, `bears` the rooms that
+    the margin lowers, `still` the variables that stay."""
+
+    at: Rooms
+    rates: Rooms
+    defect: Float[Array, "e"]
+    across: Float[Array, "e p"]
+    loose: Bool[Array, "e"]
+    bears: Float[Array, "rooms"]
+    still: Bool[Array, "p"]
+
+
+def rooms(q: Float[Array, "7"], later, unit, table: Table, limits: Limits, how, intervals: int) -> Rooms:
+    """One interval; `later` is 0 where it starts at rest, and 1 for all others."""
+    shot = shoot(table, how, intervals, q)
+    torque, log = q[2:6], q[6]
+    bounded = jnp.isfinite(limits.rate)
+    step = jnp.where(bounded, limits.rate, 1.0) / table.torque_limit * jnp.exp(log) / intervals
+    climb = jnp.where(bounded, (torque[2:] - torque[:2]) / step, 0.0)
+    span = jnp.log(limits.longest / limits.shortest)
+    free = span > 0
+    ends = jnp.stack([log - jnp.log(limits.shortest), jnp.log(limits.longest) - log]) / jnp.where(free, span, 1.0)
+    room = [(shot.forces / unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, shot.pace, ends]
+    one = jnp.full((), 1 / intervals)
+    sampled = (shot.weight[:, None] * ~spare(table)).ravel()
+    climbs = jnp.tile(jnp.where(bounded, one / 4, 0.0), 2)
+    paces = jnp.full(STEPS, one).at[0].multiply(later)
+    weight = [sampled, jnp.full(8, one / 4), climbs, paces, jnp.full(2, jnp.where(free, one / 4, 0.0))]
+    return Rooms(jnp.concatenate(room), jnp.concatenate(weight), shot.end)
+
+
+def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> Linear:
+    """Simulate all intervals, with first derivatives by forward mode."""
+    phases, knots = p.torque.shape[:2]
+
+    def both(q, later, unit, table):
+        at = rooms(q, later, unit, table, limits, how, knots - 1)
+        return at, at
+
+    each = jax.vmap(jax.vmap(jax.jacfwd(both, has_aux=True), (0, 0, None, None)))
+    later = np.ones((phases, knots - 1))
+    later[0, 0] = 0.0
+    rates, at = each(local(p), later, limits.unit, tables)
+    columns, ends = _columns(phases, knots)
+    row = np.arange(ends.size)
+    n = 4 * phases * knots + phases
+    across = jnp.zeros((ends.size, n))
+    across = across.at[row[:, None], np.repeat(columns.reshape(-1, 7), 2, axis=0)].add(rates.end.reshape(-1, 7))
+    across = across.at[row, ends.ravel()].add(-1.0)
+    defect = (at.end - p.state[:, 1:]).ravel()
+    flat, unravel = ravel_pytree(p)
+
+    def seams(x):
+        return _seams(unravel(x), tables, limits)
+
+    loose = jnp.concatenate([jnp.zeros(defect.size, bool), _loose_seams(phases, limits)])
+    bears = np.arange(at.room.shape[2]) < PARTS * STEPS * SAMPLES * ROWS
+    return Linear(
+        at,
+        rates,
+        jnp.concatenate([defect, seams(flat)]),
+        jnp.concatenate([across, jax.jacfwd(seams)(flat)]),
+        loose,
+        jnp.asarray(bears * 1.0),
+        _still(limits, phases, knots),
+    )
+
+
+def _seams(p: Variables, tables: Table, limits: Limits) -> Float[Array, "seams"]:
+    """What must vanish where one phase takes over from another at speed: the error of the speed after the impact, and,
+    where torque rates are limited, the torques' steps."""
+    if p.torque.shape[0] == 1:
+        return jnp.zeros(0)
+    before, after = (jax.tree.map(lambda a, k=k: a[k], tables) for k in (slice(0, -1), slice(1, None)))
+    speed = before.length / jnp.exp(p.log_duration[:-1]) * p.state[:-1, -1, 1]
+    lost = p.state[1:, 0, 1] - passed_on(before, after) * speed * jnp.exp(p.log_duration[1:]) / after.length
+    jump = (p.torque[1:, 0] - p.torque[:-1, -1]) * jnp.isfinite(limits.rate)
+    return jnp.concatenate([lost, jump.ravel()])
+
+
+def passed_on(before: Table, after: Table) -> Float[Array, "seams"]:
+    """`ds/dt` after the change of formation over that before it, tables stacked along the first axis."""
+
+    def one(before, after):
+        panel, xi = powers(before, before.count - 1, before.breaks[-1])
+        return change(after, horner(before.velocity[panel], xi)).speed
+
+    return jax.vmap(one)(before, after)
+
+
+def _loose_seams(phases: int, limits: Limits) -> Bool[Array, "seams"]:
+    free = jnp.tile(~jnp.isfinite(limits.rate), phases - 1)
+    return jnp.concatenate([jnp.zeros(phases - 1, bool), free])
+
+
+def _columns(phases: int, knots: int) -> tuple[Int[np.ndarray, "phases intervals 7"], Int[np.ndarray, "..."]]:
+    """Where in the flattened `Variables` each interval's seven numbers and its end state stand."""
+    size = 2 * phases * knots
+    torque, state = np.arange(size).reshape(phases, knots, 2), np.arange(size, 2 * size).reshape(phases, knots, 2)
+    duration = np.broadcast_to(2 * size + np.arange(phases)[:, None, None], (phases, knots - 1, 1))
+    return np.concatenate([state[:, :-1], torque[:, :-1], torque[:, 1:], duration], axis=2), state[:, 1:]
+
+
+def _still(limits: Limits, phases: int, knots: int) -> Bool[Array, "p"]:
+    """Pinned torques, the places where wires start and end, rest at the first start and last end, fixed durations."""
+    ends = np.zeros((phases, knots, 2), bool)
+    ends[:, [0, -1], 0] = ends[0, 0] = ends[-1, -1] = True
+    fixed = jnp.broadcast_to(limits.longest <= limits.shortest, (phases,))
+    return jnp.concatenate([jnp.repeat(limits.pinned.ravel(), 2), jnp.asarray(ends.ravel()), fixed])
+
+
+def gather(linear: Linear, values: Float[Array, "phases intervals rooms"]) -> Float[Array, "p"]:
+    """`J^T values`, with `J` the derivatives of all rooms."""
+    phases, intervals = values.shape[:2]
+    columns, _ = _columns(phases, intervals + 1)
+    pull = jnp.zeros(linear.still.shape[0]).at[columns].add(jnp.einsum("pkr,pkrq->pkq", values, linear.rates.room))
+    return jnp.where(linear.still, 0.0, pull)
+
+
+def metric(linear: Linear, values: Float[Array, "phases intervals rooms"]) -> Float[Array, "p p"]:
+    """`J^T diag(values) J`, the identity for variables that stay."""
+    phases, intervals = values.shape[:2]
+    still, n = linear.still, linear.still.shape[0]
+    columns, _ = _columns(phases, intervals + 1)
+    blocks = jnp.einsum("pkr,pkrq,pkrs->pkqs", values, linear.rates.room, linear.rates.room)
+    metric = jnp.zeros((n, n)).at[columns[..., :, None], columns[..., None, :]].add(blocks)
+    return jnp.where(still[:, None] | still, 0.0, metric) + jnp.diag(jnp.where(still, 1.0, 1e-8))
+
+
+def change_of_rooms(linear: Linear, way: Float[Array, "p"]) -> Float[Array, "phases intervals rooms"]:
+    """`J way`."""
+    phases, intervals = linear.at.room.shape[:2]
+    columns, _ = _columns(phases, intervals + 1)
+    return jnp.einsum("pkrq,pkq->pkr", linear.rates.room, way[columns])
