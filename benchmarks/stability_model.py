@@ -220,10 +220,9 @@ class Model:
 
     def crossing(self, z) -> np.ndarray:
         """Whether an object's vertex lies behind the palm or the line of a finger (scenes, places)."""
-        away, directions = self._poses(z)
-        real = (np.arange(away.shape[2]) < self.count[:, None])[:, None]
+        _, directions = self._poses(z)
+        points, _, real = self.outline(z)
         joint, _, offset, side = self._links()
-        points = z[..., None, :2] + away
         gaps = [points[..., 1]]
         for link in (1, 2):
             normal = side[link] * quarter(directions[..., link, :])
