@@ -96,6 +96,24 @@ def changed(name, **phase):
     return wa.parse(data)
 
 
+@pytest.mark.parametrize("beyond", [0.0, 2e-16, 1e-12, 1e-11])
+def test_a_wire_that_ends_at_a_kink_keeps_its_friction(beyond):
+    """A piece that is too short to tell which way a contact slips has friction of the same size as the piece before."""
+    data = to_dict(wa.load("heptagon"))
+    whole = wa.trace(wa.load("heptagon"))[1]
+    panel, xi = powers(whole.table, jnp.asarray(0), whole.table.breaks[1])
+    kink = horner(whole.table.configuration[panel], xi)
+    speed = horner(whole.table.velocity[panel], xi)
+    data["start"] = dict(zip(data["start"], end_configuration(wa.trace(wa.load("heptagon"))[0]).tolist(), strict=True))
+    data["phase"] = [data["phase"][1] | {"until": {"phi": float(kink[2] + beyond * jnp.sign(speed[2]))}}]
+    at = wa.trace(wa.parse(data))[0]
+    table, last = at.table, int(at.table.count) - 1
+    assert int(table.status) == wa.Status.OK
+    assert float(table.length) == pytest.approx(float(whole.table.breaks[1]), rel=1e-8)
+    assert last == 1 or beyond < 1e-13
+    np.testing.assert_array_equal(jnp.abs(table.tension[last]), jnp.abs(whole.table.tension[0]))
+
+
 def test_until_ends_a_phase_early():
     at = wa.trace(changed("heptagon", until={"x": -0.01}))[0]
     assert int(at.table.status) == wa.Status.OK

@@ -255,10 +255,21 @@ def _interpolate(marched, s, u):
     )
 
 
+def _decided(known, sign):
+    """A sign, or the one known from next to it where it is undecided."""
+    return jnp.where(sign != 0, sign, known)
+
+
 def _signs(values, owner, resolution):
-    """Signs of slips and joint speeds of each piece, and whether any node contradicts its piece's sign."""
+    """Signs of slips and joint speeds of each piece, and whether any node contradicts its piece's sign.
+
+    What is smooth and zero throughout a piece is zero on the whole wire. Where only a piece is too short to tell, as
+    between kinks that meet, what it adjoins holds: the piece before it, or behind it at the start.
+    """
     total = jax.ops.segment_sum(values.sum(1), owner, resolution.pieces)
     tolerance = digits(values, 5 / 8)
     signs = signs_of(total, tolerance)
+    signs = jax.lax.associative_scan(_decided, signs)
+    signs = jax.lax.associative_scan(_decided, signs, reverse=True)
     missed = jnp.any(values * signs[owner][:, None] < -tolerance) | ~jnp.all(jnp.isfinite(values))
     return signs[:, :4], signs[:, 4:], missed
