@@ -131,7 +131,9 @@ def _rows(scene, z, chosen):
 def _way(scene, z, z_dot, names, chosen, toward: str) -> Way | None:
     """Trace one way; None where it leads nowhere."""
     coordinate, sign = COORDINATES.index(toward[:-1]), 1.0 if toward[-1] == "+" else -1.0
-    nowhere = Heading(jnp.asarray(coordinate), jnp.asarray(sign), jnp.asarray(-1), jnp.asarray(0.0))
+    nowhere = Heading(
+        jnp.asarray(coordinate, int), jnp.asarray(sign, float), jnp.asarray(-1, int), jnp.asarray(0.0, float)
+    )
     traced = prepare(body(scene.object), scene.hand, scene.gravity, chosen, z, nowhere)
     table = traced.table
     status, length = Status(int(table.status)), float(table.length)

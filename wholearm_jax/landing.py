@@ -84,7 +84,7 @@ def land(table, seen, duration, how, piece, node, end, goal, floor, wanted):
 
     # Half of the digits and some: the last step below, which carries derivatives, brings the others.
     enough = digits(s, 5 / 8) * fixed[3]
-    begin = (jnp.zeros_like(fixed[3]), fixed[3], fixed[3] / 2, fixed[3], jnp.asarray(0))
+    begin = (jnp.zeros_like(fixed[3]), fixed[3], fixed[3] / 2, fixed[3], jnp.asarray(0, int))
     length = jax.lax.while_loop(going, narrow, begin)[2]
     y = step(share, length, jnp.stack([s, w]), args)
     rate = stop_gradient(field(share + length, y, args))

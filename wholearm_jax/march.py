@@ -134,7 +134,7 @@ def _begin(system, z, x, watched, tolerance, capacity) -> March:
 
     speeds = speeds_of(system, z, x)
     return March(
-        n=jnp.asarray(1),
+        n=jnp.asarray(1, int),
         step=jnp.asarray(LONGEST, z.dtype),
         z=buffer(z),
         x=buffer(x),
@@ -148,12 +148,12 @@ def _begin(system, z, x, watched, tolerance, capacity) -> March:
         charts=jnp.zeros((CHARTS, 5), z.dtype).at[0].set(x),
         anchors=jnp.zeros((CHARTS, 5), z.dtype).at[0].set(z),
         anchor_s=jnp.zeros(CHARTS, z.dtype),
-        number=jnp.asarray(0),
+        number=jnp.asarray(0, int),
         before=watched,
         beyond=watched,
-        end=jnp.asarray(-1),
+        end=jnp.asarray(-1, int),
         end_z=z,
-        status=jnp.asarray(0),
+        status=jnp.asarray(0, int),
         done=jnp.asarray(False),
     )
 
@@ -248,7 +248,7 @@ def correct(system: System, u, z, height, steps: int, enough: ArrayLike = 0.0):
         return (count < steps) & (moved > enough)
 
     far, eye = jnp.asarray(jnp.inf, z.dtype), jnp.eye(5, dtype=z.dtype)
-    start = (z, jnp.asarray(0), far, eye, jnp.ones((), z.dtype))
+    start = (z, jnp.asarray(0, int), far, eye, jnp.ones((), z.dtype))
     z, _, moved, inverted, determinant = jax.lax.while_loop(going, once, start)
     return z, jnp.where(jnp.isfinite(moved), moved, jnp.inf), inverted, determinant
 

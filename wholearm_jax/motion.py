@@ -89,9 +89,9 @@ def move(
         share=first[0],
         s=begin,
         w=w,
-        piece=jnp.asarray(0),
-        count=jnp.asarray(0),
-        status=jnp.asarray(int(Status.MAX_STEPS)),
+        piece=jnp.asarray(0, int),
+        count=jnp.asarray(0, int),
+        status=jnp.asarray(int(Status.MAX_STEPS), int),
         done=jnp.asarray(False),
         nodes=jnp.broadcast_to(first, (capacity + 1, 3)),
         entry_w=jnp.zeros(capacity, dtype),
@@ -123,7 +123,7 @@ def move(
         row=jax.vmap(lambda m: interval(seen, m))(stop_gradient(middle)),
         held=state.held,
         count=state.count,
-        status=state.status,
+        status=state.status.astype(int),
     )
 
 
@@ -134,7 +134,7 @@ def _repeated(stage, state: _State, most: int) -> _State:
         count, state = loop
         return ~state.done & (count < most)
 
-    return jax.lax.while_loop(going, lambda loop: (loop[0] + 1, stage(loop[1])), (jnp.asarray(0), state))[1]
+    return jax.lax.while_loop(going, lambda loop: (loop[0] + 1, stage(loop[1])), (jnp.asarray(0, int), state))[1]
 
 
 def _stage(table, seen, duration, how, free, state: _State) -> _State:

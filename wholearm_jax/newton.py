@@ -53,7 +53,7 @@ def newton(function: Callable, z: Float[Array, "n"], *parameters, steps: int = 2
         )  # what is left is of the square of the step
 
     far = jnp.asarray(jnp.inf, z.dtype)
-    start = (stop_gradient(z), jnp.eye(z.shape[0], dtype=z.dtype), far, jnp.asarray(0), far)
+    start = (stop_gradient(z), jnp.eye(z.shape[0], dtype=z.dtype), far, jnp.asarray(0, int), far)
     z, inverted, residual, count, _ = jax.lax.while_loop(going, step, start)
     residual = jnp.where(jnp.isfinite(residual), residual, jnp.inf)
     correction = times(stop_gradient(inverted), function(stop_gradient(z), *parameters))

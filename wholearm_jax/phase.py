@@ -65,7 +65,7 @@ def run(
     dtype = table.breaks.dtype
     arriving = jnp.asarray(np.zeros(5), dtype) if arriving is None else arriving
     start, duration, arrival = (jnp.asarray(a, dtype) for a in (start, duration, arrival))
-    goal = jnp.asarray(GOALS[goal] if isinstance(goal, str) else goal)
+    goal = jnp.asarray(GOALS[goal] if isinstance(goal, str) else goal, int)
     return _run(table, schedule, start, duration, arriving, how, goal, arrival)
 
 
@@ -98,7 +98,7 @@ def end_configuration(traced: Traced) -> Float[Array, "5"]:
 @jax.jit
 def start_configuration(table: Table) -> Float[Array, "5"]:
     """`z` (SI) where a wire starts."""
-    return configuration(table, jnp.asarray(0), table.breaks[0])
+    return configuration(table, jnp.asarray(0, int), table.breaks[0])
 
 
 def final_configuration(table: Table, motion: Motion) -> Float[Array, "5"]:
@@ -114,7 +114,7 @@ def destination(phase: Phase, traced: Traced) -> Float[Array, "5"]:
 def balance_at_start(scene: Scene, phase: Phase, traced: Traced) -> tuple[Statics, Departure]:
     """The statics where a phase begins, and the accelerations with which the object would leave."""
     table = traced.table
-    panel, xi = powers(table, jnp.asarray(0), table.breaks[0])
+    panel, xi = powers(table, jnp.asarray(0, int), table.breaks[0])
     ahead, behind = jax.device_get((horner(table.acceleration[panel], xi), horner(table.backward[panel], xi)))
     balance = statics(scene, phase.formation, start_configuration(table))
     return balance, Departure(ahead[[0, 3, 4]], behind)

@@ -114,7 +114,7 @@ def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, toleranc
         elif coarse and resolution.panels < 512:
             resolution = resolution._replace(panels=2 * resolution.panels)
         elif coarse or full:
-            return eqx.tree_at(lambda t: t.table.status, traced, jnp.asarray(int(Status.NO_CONVERGENCE)))
+            return eqx.tree_at(lambda t: t.table.status, traced, jnp.asarray(int(Status.NO_CONVERGENCE), int))
         else:
             return traced
 
@@ -148,7 +148,7 @@ def simulate_first(torque: Torque):
 
 def simulate_told(phase: Phase):
     """What a plan says of a phase's motion: its duration, its goal, and whether the next takes over at speed."""
-    return phase.duration, jnp.asarray(GOALS[phase.arrive]), jnp.asarray(phase.arrive == "moving")
+    return phase.duration, jnp.asarray(GOALS[phase.arrive], int), jnp.asarray(phase.arrive == "moving")
 
 
 def simulate_next(schedule: Torque, how: Integration, arrival, at, phase):

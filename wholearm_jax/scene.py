@@ -158,7 +158,7 @@ def polygon(vertices, mass, friction, inertia=None, center_of_mass=None) -> Poly
     padding = np.broadcast_to(given[-1], (-len(given) % 8, 2))
     return Polygon(
         vertices=jnp.asarray(np.concatenate([given, padding])),
-        count=jnp.asarray(len(given)),
+        count=jnp.asarray(len(given), int),
         mass=jnp.asarray(mass, float),
         friction=jnp.asarray(np.broadcast_to(np.asarray(friction, float), (3,))),
         inertia=None if inertia is None else jnp.asarray(inertia, float),
@@ -179,10 +179,10 @@ def heading(toward: str | None, until: Mapping[Any, float] | None = None) -> Hea
     to stop at."""
     coordinate, value = next(iter(until.items())) if until else (None, 0.0)
     return Heading(
-        coordinate=jnp.asarray(COORDINATES.index(toward[:-1]) if toward else -1),
-        sign=jnp.asarray(-1.0 if toward and toward[-1] == "-" else 1.0),
-        until_coordinate=jnp.asarray(-1 if coordinate is None else COORDINATES.index(coordinate)),
-        until_value=jnp.asarray(float(value)),
+        coordinate=jnp.asarray(COORDINATES.index(toward[:-1]) if toward else -1, int),
+        sign=jnp.asarray(-1.0 if toward and toward[-1] == "-" else 1.0, float),
+        until_coordinate=jnp.asarray(-1 if coordinate is None else COORDINATES.index(coordinate), int),
+        until_value=jnp.asarray(value, float),
     )
 
 

@@ -272,7 +272,7 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
         object=polygon(shape.vertices, shape.mass, each, shape.inertia, shape.center_of_mass),
         start=jnp.asarray([getattr(checked.start, c) for c in COORDINATES]),
         phases=tuple(
-            Phase(p.name, formation(p.contacts), heading(p.toward, p.until), jnp.asarray(p.duration), _arrive(p))
+            Phase(p.name, formation(p.contacts), heading(p.toward, p.until), jnp.asarray(p.duration, float), _arrive(p))
             for p in checked.phase
         ),
     )

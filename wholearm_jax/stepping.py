@@ -96,7 +96,7 @@ class _Repeat(dfx.AbstractStepSizeController):
         return self
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        return self.ends[0], jnp.asarray(1)
+        return self.ends[0], jnp.asarray(1, int)
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, state):
         following = self.ends[jnp.minimum(state, self.ends.shape[0] - 1)]
