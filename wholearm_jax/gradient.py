@@ -13,7 +13,7 @@ from wholearm_jax.plan import least, outcomes, steps_within, trace
 from wholearm_jax.precision import require_x64
 from wholearm_jax.scene import Scene
 from wholearm_jax.schedule import Torque
-from wholearm_jax.stepping import Integration
+from wholearm_jax.stepping import Integration, tolerance_as_data
 
 FORWARD = 16
 
@@ -33,7 +33,7 @@ def torque_gradient(
     """
     require_x64()
     how = Integration(tolerance=tolerance, adjoint=mode(torque), steps=steps_within(scene, torque))
-    return _gradient(scene, torque, traced or trace(scene), how)
+    return _gradient(scene, torque, traced or trace(scene), tolerance_as_data(how, torque.times.dtype))
 
 
 def mode(torque: Torque) -> str:

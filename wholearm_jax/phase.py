@@ -18,7 +18,7 @@ from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Change, Table, change, horner, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, contact_name
 from wholearm_jax.schedule import Torque, window
-from wholearm_jax.stepping import Integration
+from wholearm_jax.stepping import Integration, tolerance_as_data
 from wholearm_jax.system import system
 from wholearm_jax.verdict import ARRIVAL, GOALS, Verdict, judge
 from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
@@ -65,6 +65,7 @@ def run(
     dtype = table.breaks.dtype
     arriving = jnp.asarray(np.zeros(5), dtype) if arriving is None else arriving
     start, duration, arrival = (jnp.asarray(a, dtype) for a in (start, duration, arrival))
+    how = tolerance_as_data(how, dtype)
     goal = jnp.asarray(GOALS[goal] if isinstance(goal, str) else goal, int)
     return _run(table, schedule, start, duration, arriving, how, goal, arrival)
 

@@ -21,7 +21,7 @@ from wholearm_jax.result import Result, describe
 from wholearm_jax.scene import Body, Phase, Scene, body
 from wholearm_jax.schedule import Torque, has_steps, padded
 from wholearm_jax.status import Status
-from wholearm_jax.stepping import Integration
+from wholearm_jax.stepping import Integration, tolerance_as_data
 from wholearm_jax.verdict import ARRIVAL, GOALS
 from wholearm_jax.wire import Resolution
 
@@ -126,7 +126,9 @@ def outcomes(
     alike = len({tuple(leaf.shape for leaf in jax.tree.leaves(one)) for one in traced}) == 1
     if alike and transformed(scene, torque, traced):
         phases = stacked([(at.table, *simulate_told(phase)) for at, phase in zip(traced, scene.phases, strict=True)])
-        return _apart(_outcomes_together(phases, padded(torque), how, arrival), len(traced))
+        dtype = torque.times.dtype
+        how = tolerance_as_data(how, dtype)
+        return _apart(_outcomes_together(phases, padded(torque), how, jnp.asarray(arrival, dtype)), len(traced))
     at, found, schedule = simulate_first(torque), [], padded(torque)
     for phase, one in zip(scene.phases, traced, strict=True):
         at, outcome = simulate_next(schedule, how, arrival, at, (one.table, *simulate_told(phase)))

@@ -13,7 +13,6 @@ speed that fits (`verdict`); the next phase then starts at rest at the end, as i
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +23,7 @@ from wholearm_jax.forces import smooth_margin
 from wholearm_jax.optimiser import optimise
 from wholearm_jax.phase import Traced
 from wholearm_jax.plan import outcomes, steps_within, trace
+from wholearm_jax.programs import Program
 from wholearm_jax.schedule import Torque
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
@@ -77,7 +77,9 @@ def optimise_robustly(
     start = optimise(scene, knots=knots).torque if nominal is None else nominal
     seen, unseen = (_traced(ensemble, jnp.arange(samples) + first) for first in (0, samples))
     how = replace(HOW, steps=steps_within(scene, start))
-    tried = jax.jit(lambda torque, traced: _climb(torque, scene, traced, jnp.asarray(arrival), how))
+
+    def tried(torque: Torque, traced) -> _Climbed:
+        return _climb(torque, scene, traced, jnp.asarray(arrival, float), how)
 
     def held(found) -> Held:
         return Held(float(found.holds.mean()), float(jnp.quantile(found.margins, quantile, method="lower")))
@@ -113,12 +115,13 @@ class _Climbed(NamedTuple):
     slope: Float[Array, "rows 2"]
 
 
-@eqx.filter_jit
+@Program
 def _traced(ensemble: Ensemble, numbers) -> tuple[Traced, ...]:
     """The wires of some scenes."""
     return jax.lax.map(lambda n: trace(ensemble.draw(n), resolution=COARSE), numbers, batch_size=32)
 
 
+@Program
 def _climb(torque: Torque, scene, traced, arrival, how: Integration) -> _Climbed:
     """How a schedule does on all samples, and which way it gets better."""
 

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+ROWS = 128  # schedules are padded to a multiple of this: those of like length share compiled programs
+
 
 class Torque(eqx.Module):
     """A torque schedule: `times` [s], non-decreasing, and `values` [N m], one row `(tau1, tau2)` a time.
@@ -62,14 +64,14 @@ def has_steps(schedule: Torque, start: float, end: float) -> bool:
     return bool(np.any((stepped > start) & (stepped < end)))
 
 
-def rounded(rows: int, multiple: int = 64) -> int:
+def rounded(rows: int, multiple: int = ROWS) -> int:
     """The next multiple: as long as `padded` makes a schedule of `rows`."""
     return -(-rows // multiple) * multiple
 
 
 @partial(jax.jit, static_argnames="multiple")
-def padded(schedule: Torque, multiple: int = 64) -> Torque:
-    """The same schedule with its last row repeated, so that schedules of like length share a compiled program."""
+def padded(schedule: Torque, multiple: int = ROWS) -> Torque:
+    """The same schedule with its last row repeated."""
     missing = rounded(schedule.times.shape[0], multiple) - schedule.times.shape[0]
     ramp = schedule.times[-1] + (schedule.times[-1] - schedule.times[0]) * jnp.arange(1, missing + 1)
     rows = jnp.broadcast_to(schedule.values[-1], (missing, 2))

@@ -1,6 +1,7 @@
 """Steps: how a motion is integrated, and the controllers that choose its steps."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import diffrax as dfx
 import equinox as eqx
@@ -23,7 +24,7 @@ class Integration(eqx.Module):
     differentiated by: `"none"`, `"forward"`, `"reverse"` or `"both"`. Where reverse mode is wanted, the steps are found
     once by the adaptive controller and taken again as they are: differentiating saved steps through rejected ones in
     reverse mode gives wrong derivatives (seen with diffrax 0.7.2), and the repetition has none. All but a `tolerance`
-    that is an array is static: each choice is a program of its own.
+    that is an array is static: each choice is a program of its own. The package's own programs get theirs as data.
     """
 
     solver: dfx.AbstractSolver = eqx.field(static=True, default=dfx.Dopri8())
@@ -32,6 +33,11 @@ class Integration(eqx.Module):
     stages: int = eqx.field(static=True, default=8)
     steps: bool = eqx.field(static=True, default=False)
     adjoint: str = eqx.field(static=True, default="none")
+
+
+def tolerance_as_data(how: Integration, dtype) -> Integration:
+    """The same integration, with a tolerance that is an array: all tolerances share a program."""
+    return replace(how, tolerance=jnp.asarray(how.tolerance, dtype))
 
 
 def adaptive(how: Integration, way, knots) -> dfx.AbstractStepSizeController:
