@@ -14,7 +14,8 @@ from wholearm_jax.variation import vary
 def found():
     plan = wa.load("heptagon")
     slide = eqx.tree_at(lambda s: s.phases, plan, plan.phases[:1])
-    nominal = wa.read_torque(Path(__file__).parent / "data" / "heptagon_torque.csv")
+    both = wa.read_torque(Path(__file__).parent / "data" / "heptagon_torque.csv")
+    nominal = wa.torque(both.times[:51], both.values[:51])
     return optimise_robustly(
         vary(slide, {"friction": "20%"}, seed=1), samples=12, steps=40, arrival=0.02, nominal=nominal
     )
