@@ -2,8 +2,9 @@
 
     python benchmarks/cold_start.py [--repeats N]
 
-Each run is a process of its own, as a user starts it. With an empty cache folder everything is compiled; the second
-run finds the first one's programs there. `apart` splits one more process of each kind by what JAX itself reports:
+Each run is a process of its own, as a user starts it: `first` is when it prints its first result, `exit` when files and
+figures are written, too. With an empty cache folder everything is compiled; the second run finds the first one's
+programs there. `apart` splits one more process of each kind by what JAX itself reports:
 importing, tracing Python into programs and lowering them (threads overlap, so that parts may sum to more than the
 whole), compiling, reading kept programs, and the rest (figures, files, the computation). `plain` compiles as XLA does
 by default, without the command line's choice of emitters.
@@ -66,14 +67,18 @@ def environment(cache: Path, flags: str = "") -> dict[str, str]:
     return mine | {"XDG_CACHE_HOME": str(cache)} | ({"XLA_FLAGS": flags} if flags else {})
 
 
-def run(arguments, cache: Path, out: Path, flags: str = "") -> float:
-    """Wall time [s] of one process."""
+def run(arguments, cache: Path, out: Path, flags: str = "") -> dict[str, float]:
+    """Wall times [s] of one process: to the first line that it prints, which is the first phase's, and to its exit."""
     begun = time.perf_counter()
-    command = [sys.executable, "-m", "wholearm_jax.command", *arguments, "--out", str(out)]
-    done = subprocess.run(command, env=environment(cache, flags), capture_output=True, text=True)
-    if done.returncode == 2:
-        raise RuntimeError(done.stderr)
-    return time.perf_counter() - begun
+    command = [sys.executable, "-u", "-m", "wholearm_jax.command", *arguments, "--out", str(out)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    with subprocess.Popen(command, env=environment(cache, flags), **pipes) as process:
+        process.stdout.readline()
+        first = time.perf_counter() - begun
+        process.stdout.read()
+    if process.returncode == 2:
+        raise RuntimeError(f"{' '.join(arguments)}: refused")
+    return {"first": first, "exit": time.perf_counter() - begun}
 
 
 def apart(arguments, cache: Path, out: Path) -> dict[str, float]:
@@ -95,8 +100,12 @@ def measured(name: str, arguments, repeats: int, torque: Path) -> dict:
             plain.append(run(arguments, Path(folder, f"plain{k}"), out, PLAIN))
         fresh = Path(folder, "apart")
         parts = {"cold": apart(arguments, fresh, out), "kept": apart(arguments, fresh, out)}
-    medians = {"cold": statistics.median(cold), "kept": statistics.median(kept), "plain": statistics.median(plain)}
-    return {"seconds": medians, "runs": {"cold": cold, "kept": kept, "plain": plain}, "apart": parts}
+    runs = {"cold": cold, "kept": kept, "plain": plain}
+    medians = {
+        kind: {until: statistics.median(one[until] for one in several) for until in ("first", "exit")}
+        for kind, several in runs.items()
+    }
+    return {"seconds": medians, "runs": runs, "apart": parts}
 
 
 def draw(found: dict, path: Path) -> None:
@@ -111,11 +120,13 @@ def draw(found: dict, path: Path) -> None:
                 width = parts.get(part, 0.0)
                 ax.barh(len(labels), width, left=left, color=colour, label=part if not labels else None)
                 left += width
-            ax.plot(result["seconds"][kind], len(labels), "|", color="#222222", ms=14, mew=2)
+            for until, stroke in (("first", ":"), ("exit", "-")):
+                ends = [len(labels) - 0.45, len(labels) + 0.45]
+                ax.plot([result["seconds"][kind][until]] * 2, ends, stroke, color="#222222", lw=2)
             labels.append(f"{name}, {kind}")
     ax.set_yticks(range(len(labels)), labels)
     ax.invert_yaxis()
-    ax.set_xlabel("time [s]: parts, which overlap; the stroke is the whole process from start to exit")
+    ax.set_xlabel("time [s]: parts, which overlap; from process start to the first result (dotted) and to exit (line)")
     ax.legend(frameon=False, loc="lower right")
     figure.savefig(path)
     plt.close(figure)
@@ -133,7 +144,8 @@ def main() -> None:
     path = measure.save("cold_start", found)
     draw(found, path.with_suffix(".svg"))
     for name, result in found.items():
-        print(f"{name}: " + ", ".join(f"{kind} {value:.1f} s" for kind, value in result["seconds"].items()))
+        for kind, seconds in result["seconds"].items():
+            print(f"{name}, {kind}: first result {seconds['first']:.1f} s, exit {seconds['exit']:.1f} s")
         for kind, parts in result["apart"].items():
             print(f"  {kind}: " + ", ".join(f"{part} {value:.1f}" for part, value in parts.items()))
 

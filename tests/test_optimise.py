@@ -100,6 +100,20 @@ def test_a_formation_that_cannot_be_held_is_said_before_any_search():
     assert found.result.status is not wa.Status.OK
 
 
+def test_a_descent_does_not_circle_where_knots_pass_kinks():
+    """At this pace full steps throw the least force from near its best to minus twenty times the bound and back."""
+    data = to_dict(wa.load("heptagon"))
+    x = (0.0385, 0.0337, -0.0035, -0.026, -0.0405, -0.0289, 0.0097, 0.033)
+    y = (-0.0102, 0.022, 0.0368, 0.0221, -0.0026, -0.0254, -0.0347, -0.0189)
+    data["object"] = {"vertices": list(zip(x, y, strict=True)), "mass": 0.28, "friction": 0.19}
+    data["start"] = {"x": 0.04168, "y": 0.03372, "phi": -0.59588, "theta1": 1.52693, "theta2": 0.56554}
+    contacts = ["palm:v6", "palm:v7", "finger1:v1", "finger2:v4"]
+    data["phase"] = [{"name": "slide left", "contacts": contacts, "toward": "x-", "duration": 0.3}]
+    found = wa.optimise(wa.parse(data))
+    assert found.result.status is wa.Status.OK
+    assert found.reached[0] > 0.9
+
+
 def test_a_phase_that_brakes_to_the_last_ends_on_time():
     """It comes to rest and to the wire's end at once: whichever is met first, the time is that of the phase."""
     data = to_dict(wa.load("heptagon"))

@@ -12,11 +12,15 @@ curvature of the simulation itself is left out (Gauss-Newton). It is an optax gr
 optax optimiser may take its place (`projected`).
 
 A step follows the curve on which accelerations and squeezes at the knots change evenly (`moved`): on it the intervals
-are nearly linear. Source of the interior point: J. Nocedal and S. J. Wright, Numerical Optimization, 2006, chapter 19.
+are nearly linear. One that raises the loss, with a penalty on `|e|`, is taken again with a part of its length; and
+where limits leave only tiny steps, the temperature rises again, and stays above the one at which that happened.
+Source of the interior point and of the penalty: J. Nocedal and S. J. Wright, Numerical Optimization, 2006, chapters 18
+and 19.
 
 Derivation: section 9 of `docs/derivation.md`.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -39,18 +43,27 @@ NEAR = 0.95  # share of the way to a limit that a step may go
 LEAST = 0.05  # slack that a room starts with at least
 LONGEST = (0.1, 0.5)  # most that `s` and `v` at a knot may change in a step [lengths, lengths a duration]
 SHORTER = 0.25  # a step that leaves what can be simulated is taken again with this share of it
+SMALL = 1e-3  # a share of a step that is taken whatever becomes of the merit
+RISE = 0.01  # most that a step may raise the merit, as a share of the bound
+EDGE = 1e-3  # room below which the merit's logarithm goes on as its tangent
+JAMMED = 0.02  # share of a step, below which limits count as leaving no way: the temperature rises `WARMER` times
+WARMER = 3.0
+FLOOR, WARMEST = 4.0, 0.01  # a jam at the coldest makes that so many times warmer, but no warmer than this
 JOINED = 1e-9  # sum of the defects below which the intervals count as joined
 
 
 class Duals(NamedTuple):
     """The interior point's own unknowns: slack and price of every room, the level `m` of the margin (NaN: not yet
-    chosen), the temperature, and the shares of its last step that were taken."""
+    chosen), the temperature and the `coldest` that it may become, the shares of its last step that were taken, and the
+    largest price of joining the intervals."""
 
     slack: Float[Array, "phases intervals rooms"]
     price: Float[Array, "phases intervals rooms"]
     level: Float[Array, ""]
     temperature: Float[Array, ""]
+    coldest: Float[Array, ""]
     steps: Float[Array, "2"]
+    joining: Float[Array, ""]
 
 
 def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
@@ -59,8 +72,8 @@ def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
     def init(params):
         knots = (params.shape[0] // phases - 1) // 4
         shape = (phases, knots - 1, PARTS * STEPS * SAMPLES * ROWS + 8 + 4 + STEPS + 2)
-        start = jnp.full((), HOTTEST)
-        return Duals(jnp.ones(shape), jnp.zeros(shape), jnp.full((), jnp.nan), start, jnp.zeros(2))
+        level, hot, cold = (jnp.full((), value) for value in (jnp.nan, HOTTEST, COLDEST))
+        return Duals(jnp.ones(shape), jnp.zeros(shape), level, hot, cold, jnp.zeros(2), jnp.zeros(()))
 
     def update(updates, state: Duals, params=None, *, linear: Linear, **_):
         at, bears, hot = linear.at, linear.bears, state.temperature
@@ -75,20 +88,24 @@ def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
         stiff = price / slack
         miss = given - slack
         aim = jnp.where(live, target - stiff * miss, 0.0)
-        way, rise = _solve(linear, stiff, aim)
+        way, rise, forces = _solve(linear, stiff, aim)
         dslack = change_of_rooms(linear, way) - bears * rise + miss
         dslack = jnp.where(live, dslack, 0.0)
         dprice = jnp.where(live, target - price - stiff * dslack, 0.0)
         primal = jnp.minimum(_reach(slack, dslack), _cap(linear, way))
         dual = _reach(price, dprice)
         both = jnp.minimum(primal, dual)
-        cooling = jnp.where(both > 0.5, 0.2, jnp.where(both > 0.2, 0.6, 1.0))
+        cooling = jnp.select([both > 0.5, both > 0.2, both > JAMMED], [0.2, 0.6, 1.0], WARMER)
+        floor = (both < JAMMED) & (hot < 2 * state.coldest)
+        coldest = jnp.where(floor, jnp.minimum(FLOOR * state.coldest, WARMEST), state.coldest)
         state = Duals(
             slack + primal * dslack,
             price + dual * dprice,
             level + primal * rise,
-            jnp.maximum(hot * cooling, COLDEST),
+            jnp.clip(hot * cooling, coldest, HOTTEST),
+            coldest,
             jnp.stack([primal, dual]),
+            jnp.abs(forces).max(),
         )
         return primal * way, state
 
@@ -96,7 +113,7 @@ def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
 
 
 def _solve(linear: Linear, stiff, aim):
-    """The step of `p` and of the margin's level: one symmetric system with the joining of the intervals."""
+    """The step of `p` and of the margin's level, and the prices of joining the intervals: one symmetric system."""
     bears, across = linear.bears, jnp.where(linear.still | linear.loose[:, None], 0.0, linear.across)
     e, n = across.shape
     lean = gather(linear, stiff * bears)
@@ -107,7 +124,7 @@ def _solve(linear: Linear, stiff, aim):
     matrix = matrix.at[n + 1 :, n + 1 :].set(-jnp.diag(1.0 * linear.loose))
     right = [gather(linear, aim), (1 - (bears * aim).sum())[None], jnp.where(linear.loose, 0.0, -linear.defect)]
     step = jnp.linalg.solve(matrix, jnp.concatenate(right))
-    return step[:n], step[n]
+    return step[:n], step[n], step[n + 1 :]
 
 
 def _reach(value, change):
@@ -143,12 +160,15 @@ def _follow(linear: Linear):
 
 
 class Cooling(NamedTuple):
-    """State of `projected`: the inner optimiser's, the level `m` of the smooth margin, and the temperature."""
+    """State of `projected`: the inner optimiser's, the level `m` of the smooth margin, and as in `Duals`. Its steps
+    keep the intervals joined, as far as they are linear: that has no price."""
 
     inner: optax.OptState
     level: Float[Array, ""]
     temperature: Float[Array, ""]
+    coldest: Float[Array, ""]
     steps: Float[Array, "2"]
+    joining: Float[Array, ""]
 
 
 def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) -> optax.GradientTransformationExtraArgs:
@@ -157,7 +177,8 @@ def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) ->
     optimiser = optax.with_extra_args_support(optimiser)
 
     def init(params):
-        return Cooling(optimiser.init(params), jnp.full((), jnp.nan), jnp.full((), HOTTEST), jnp.zeros(2))
+        level, hot, cold = (jnp.full((), value) for value in (jnp.nan, HOTTEST, COLDEST))
+        return Cooling(optimiser.init(params), level, hot, cold, jnp.zeros(2), jnp.zeros(()))
 
     def update(updates, state: Cooling, params=None, *, linear: Linear, **extra):
         at, hot = linear.at, state.temperature
@@ -179,8 +200,9 @@ def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) ->
         within = (at.weight > 0) & (linear.bears == 0) & (at.room > 0)
         reach = _reach(jnp.where(within, at.room, 1.0), jnp.where(within, change, 0.0))
         share = jnp.minimum(reach, _cap(linear, way))
-        cooled = jnp.maximum(cooling * hot, COLDEST)
-        return share * way, Cooling(inner, level, cooled, jnp.stack([share, share]))
+        cooled = jnp.maximum(cooling * hot, state.coldest)
+        after = Cooling(inner, level, cooled, state.coldest, jnp.stack([share, share]), state.joining)
+        return share * way, after
 
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
 
@@ -227,43 +249,67 @@ class Descent(NamedTuple):
     """A descent on its way: variables, the optimiser's state, and the step that led here, to take again if it failed.
 
     `least` is each phase's smallest sampled force over its unit and `apart` the sum of the defects, both of the
-    variables before the step (NaN where they cannot be simulated). `reach` is the part of a step that is taken.
+    variables before the step (NaN where those were not kept). `reach` is the part of a step that is taken. `merit` is
+    that of the variables before the step at the temperature `hot`.
     """
 
     p: Variables
-    state: Any  # the optimiser's, with `temperature` and `steps`
+    state: Any  # the optimiser's, with `temperature`, `coldest`, `steps` and `joining`
     before: Variables
     way: Variables
     share: Float[Array, ""]
     least: Float[Array, "phases"]
     apart: Float[Array, ""]
     reach: Float[Array, ""]
+    merit: Float[Array, ""]
+    hot: Float[Array, ""]
+
+
+def merit(linear: Linear, hot, joining) -> Float[Array, ""]:
+    """What steps shall lower: the loss at a temperature, and a penalty of twice the price of `joining` on `|e|`.
+
+    Where a room is none, as a start may have it, its logarithm goes on as a tangent.
+    """
+    at, bears = linear.at, linear.bears
+    margin, _ = smooth_margin(at.room, at.weight * bears, hot)
+    weight = at.weight * (1 - bears)
+    room = jnp.where(weight > 0, at.room, 1.0)
+    log = jnp.where(room > EDGE, jnp.log(jnp.maximum(room, EDGE)), math.log(EDGE) + (room - EDGE) / EDGE)
+    return -margin - hot * (weight * log).sum() + 2 * joining * _apart(linear)
+
+
+def _apart(linear: Linear):
+    return jnp.where(linear.loose, 0.0, jnp.abs(linear.defect)).sum()
 
 
 @Program
 def begin(p: Variables, optimiser) -> Descent:
     """A descent before its first step."""
     zero, still = jnp.zeros(()), jax.tree.map(jnp.zeros_like, p)
-    return Descent(p, optimiser.init(ravel_pytree(p)[0]), p, still, zero + 1, 0 * p.log_duration, zero, zero + 1)
+    state = optimiser.init(ravel_pytree(p)[0])
+    return Descent(p, state, p, still, zero + 1, 0 * p.log_duration, zero, zero + 1, zero + jnp.inf, state.temperature)
 
 
 @Program
 def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimiser) -> Descent:
-    """Simulate, and take a step; where `d.p` cannot be simulated, go back and take a shorter one."""
+    """Simulate, and take a step; where `d.p` cannot be simulated or is worse, go back and take a shorter one."""
     linear = linearise(d.p, tables, limits, how)
     at = linear.at
     sound = jnp.all(jnp.isfinite(at.room)) & jnp.all(jnp.isfinite(linear.defect))
+    better = merit(linear, d.hot, d.state.joining) <= d.merit + RISE
     least = jnp.where((at.weight > 0) & (linear.bears > 0), at.room, jnp.inf).min((1, 2))
-    apart = jnp.where(linear.loose, 0.0, jnp.abs(linear.defect)).sum()
+    apart = _apart(linear)
 
     def onward():
         flat, unravel = ravel_pytree(d.p)
         way, state = optimiser.update(jnp.zeros_like(flat), d.state, flat, linear=linear)
-        return Descent(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart, d.reach)
+        hot = d.state.temperature
+        here = merit(linear, hot, state.joining)
+        return Descent(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart, d.reach, here, hot)
 
     def again():
         least, apart = (jnp.full_like(a, jnp.nan) for a in (d.least, d.apart))
         return d._replace(share=d.share * SHORTER, least=least, apart=apart)
 
-    after = jax.lax.cond(sound, onward, again)
+    after = jax.lax.cond(sound & (better | (d.share < SMALL)), onward, again)
     return after._replace(p=moved(after.before, after.way, after.share * after.reach, tables, limits))

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.descent import COLDEST, JOINED, advance, begin, interior_point, projected
+from wholearm_jax.descent import JOINED, advance, begin, interior_point, projected
 from wholearm_jax.guesses import guesses
 from wholearm_jax.linearisation import Limits
 from wholearm_jax.phase import Traced, balance_at_start, run
@@ -286,15 +286,15 @@ def _descend(task: _Task, start: Variables, number: int, limits: Limits, method,
     for count in range(task.steps):
         begun = time.perf_counter()
         after = advance(d, tables, limits, _HOW, method)
-        least, apart, hot, shares, share = jax.device_get(
-            (after.least, after.apart, after.state.temperature, after.state.steps, after.share)
+        least, apart, hot, coldest, shares, share = jax.device_get(
+            (after.least, after.apart, after.state.temperature, after.state.coldest, after.state.steps, after.share)
         )
         margin = float((least * task.bounds).min())
         step = Step(task.index, number, count, float(hot), margin, float(apart), time.perf_counter() - begun)
         history.append(step)
         if callback is not None:
             callback(step)
-        if apart < JOINED and hot <= COLDEST and (shares.min() >= 1 or least.min() >= 1 - task.tolerance):
+        if apart < JOINED and hot <= coldest and (shares.min() >= 1 or least.min() >= 1 - task.tolerance):
             return d.p, "the margin no longer improves", history
         if share < LOST:
             return d.p, "no step leads on", history
