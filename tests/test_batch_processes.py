@@ -30,10 +30,10 @@ def command():
     return [sys.executable, "-c", run, "check", "heptagon", "--torque", str(torque), *varied, *settings]
 
 
-def start(command, store: Path, *more: str) -> subprocess.Popen:
-    """Begin the command in a process of its own, on one device, which shares the tests' compiled programs."""
-    kept = jax.config.values["jax_compilation_cache_dir"]
-    environment = {**os.environ, "MPLBACKEND": "agg", "JAX_COMPILATION_CACHE_DIR": kept, "JAX_NUM_CPU_DEVICES": "1"}
+def start(command, store: Path, *more: str, devices: int = 1) -> subprocess.Popen:
+    """Begin the command in a process of its own, which shares the tests' compiled programs."""
+    kept = {"JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"]}
+    environment = {**os.environ, "MPLBACKEND": "agg", **kept, "JAX_NUM_CPU_DEVICES": str(devices)}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "env": environment}
     return subprocess.Popen([*command, "--out", str(store), *more], **pipes)
 
@@ -74,6 +74,16 @@ def test_killed_at_any_moment_it_goes_on_to_the_same_store(command, whole, tmp_p
         assert np.isin(np.frombuffer(contents(path)["done"], "uint8"), (0, 1)).all()  # it can always be read
     finish(start(command, path))
     assert contents(path) == whole
+
+
+def test_two_devices_find_what_one_does(command, whole, tmp_path):
+    """Another program, that rounds differently: but for the last digits."""
+    path = tmp_path / "two.zarr"
+    finish(start(command, path, devices=2))
+    for name, values in contents(path).items():
+        kind = np.asarray(zarr.open_group(str(path), mode="r")[name][:]).dtype
+        both = (np.frombuffer(each, kind) for each in (values, whole[name]))
+        np.testing.assert_allclose(*both, rtol=1e-9, atol=1e-12)
 
 
 FOUR = pytest.mark.skipif((os.cpu_count() or 1) < 4, reason="four processes that compile take a minute on two cores")
