@@ -71,13 +71,13 @@ def run(arguments, cache: Path, out: Path, flags: str = "") -> dict[str, float]:
     """Wall times [s] of one process: to the first line that it prints, which is the first phase's, and to its exit."""
     begun = time.perf_counter()
     command = [sys.executable, "-u", "-m", "wholearm_jax.command", *arguments, "--out", str(out)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, env=environment(cache, flags), **pipes) as process:
         process.stdout.readline()
         first = time.perf_counter() - begun
-        process.stdout.read()
+        _, complaints = process.communicate()
     if process.returncode == 2:
-        raise RuntimeError(f"{' '.join(arguments)}: refused")
+        raise RuntimeError(complaints)
     return {"first": first, "exit": time.perf_counter() - begun}
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from wholearm_jax.contacts import every_contact, frames, normal_rows
 from wholearm_jax.phase import Traced, end_configuration, ending, prepare
 from wholearm_jax.reduction import Table, change, horner, powers
-from wholearm_jax.scene import COORDINATES, Heading, Phase, Scene, body, contact_name, formation
+from wholearm_jax.scene import COORDINATES, Phase, Scene, body, contact_name, formation, heading
 from wholearm_jax.squeeze import Bound, bound, hold
 from wholearm_jax.status import Status
 from wholearm_jax.system import system
@@ -130,16 +130,13 @@ def _rows(scene, z, chosen):
 
 def _way(scene, z, z_dot, names, chosen, toward: str) -> Way | None:
     """Trace one way; None where it leads nowhere."""
-    coordinate, sign = COORDINATES.index(toward[:-1]), 1.0 if toward[-1] == "+" else -1.0
-    nowhere = Heading(
-        jnp.asarray(coordinate, int), jnp.asarray(sign, float), jnp.asarray(-1, int), jnp.asarray(0.0, float)
-    )
-    traced = prepare(body(scene.object), scene.hand, scene.gravity, chosen, z, nowhere)
+    onward = heading(toward)
+    traced = prepare(body(scene.object), scene.hand, scene.gravity, chosen, z, onward)
     table = traced.table
     status, length = Status(int(table.status)), float(table.length)
     if status is Status.OK and length < SHORTEST:
         return None
-    phase = Phase("", chosen, nowhere, jnp.ones(()))
+    phase = Phase("", chosen, onward, jnp.ones(()))
     known = status is Status.OK
     top, static = (float(v) for v in _value(table)) if known else (float("-inf"), float("-inf"))
     entered = change(table, jnp.zeros(5) if z_dot is None else z_dot)
