@@ -71,13 +71,16 @@ def _keep_compiled() -> None:
 
 
 def compile_quickly() -> None:
-    """Have XLA emit kernels in its older way: half of the compile time, at a tenth more run time for one scene.
+    """Have XLA emit kernels in its older way: half of the compile time, at a tenth more run time for one scene; and
+    optimise them little: a tenth less again, at no run time that can be measured.
 
-    XLA refuses flags that it does not know: this is for the version that was measured.
+    XLA refuses flags that it does not know: this is for the version that was measured. What a user sets stays.
     """
-    flags = os.environ.get("XLA_FLAGS", "")
-    if jax.__version_info__[:2] == (0, 10) and "xla_cpu_use_fusion_emitters" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
+    given = os.environ.get("XLA_FLAGS", "")
+    quick = ("--xla_cpu_use_fusion_emitters=false", "--xla_backend_optimization_level=1")
+    added = [flag for flag in quick if flag.partition("=")[0] not in given]
+    if jax.__version_info__[:2] == (0, 10):
+        os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
 
 
 @app.command()
