@@ -1,9 +1,10 @@
 """Does the prediction hold? Hundreds of random plans, predicted by the model and executed by free bodies in MuJoCo.
 
-    python benchmarks/prediction.py [--stopping 70] [--flying 20] [--seed 0] [--quick]
+    python benchmarks/prediction.py [--pausing 50] [--stopping 20] [--flying 15] [--seed 0] [--quick]
 
-Plans of two phases that stop between them (`random_plans`) get optimised and quasi-static torques in turn, plans of
-three that do not (`flying_plans`) optimised ones. These are then spoiled. A *squeeze* adds torques along the one
+Plans of two phases (`random_plans`) get optimised and quasi-static torques in turn. Half way they hold the object for
+`PAUSE`, or, to see what that is worth, stop and go on at once. Plans of three phases that do not stop (`flying_plans`)
+get optimised torques. These are then spoiled. A *squeeze* adds torques along the one
 direction that leaves the motion as it is, as many as move the predicted least force to a place drawn evenly on both
 sides of zero. A *push* adds torques along the other direction, so that the object falls short. Variants are drawn until
 a plan has two that are predicted to hold and two to fail, or the draws are used up. One that is predicted to reach a
@@ -15,7 +16,8 @@ What counts, by the same tolerances on both sides:
   end left out), no impulse pulls, no hold is infeasible, and every phase ends within `TOLERANCE` (0.5 mm, 0.01 rad) of
   its wire's end;
 - *executed to hold*: `execution.execute` at 0.05 ms ends `ok` (within the same tolerance, the last contacts closed to
-  0.5 mm), and no contact of a formation was without force for `FREE` running, its phase's ends left out alike.
+  0.5 mm), and no contact of a formation was without force for `FREE` running, its phase's ends left out alike. Forces
+  while the object is held are not determined, and not judged.
 
 A prediction is *strict* where no force may be tensile at any moment; agreement is given for that as well.
 Disagreements are executed again with steps of a quarter, and contacts as much harder, and put into classes.
@@ -39,10 +41,11 @@ from random_plans import plans as stopping_plans
 import wholearm_jax as wa
 from wholearm_jax.execution import Ending, Tolerance, execute
 from wholearm_jax.palette import LINK_COLOURS as COLOURS
-from wholearm_jax.phase import end_configuration, start_configuration
+from wholearm_jax.phase import destination, end_configuration, start_configuration
 from wholearm_jax.proportion import wilson
 from wholearm_jax.result import Result
 from wholearm_jax.sampling import sample
+from wholearm_jax.scene_file import to_dict
 from wholearm_jax.schedule import padded
 from wholearm_jax.squeeze import coefficients
 from wholearm_jax.status import Status
@@ -54,6 +57,7 @@ TOLERANCE = Tolerance()
 FREE = 5e-3  # [s] without force from which a contact counts as lost; shorter is chatter of the contact's softness
 MARGIN_OF_TIME = 0.02  # [s] at either end of a phase, while formations change, in which forces are not judged
 HURRY, EARLY = 0.1, 0.05  # speed over the mean speed, and share of the phase left, with which a wire's end is too early
+PAUSE = 0.1  # [s] for which a pausing plan holds the object
 EACH, DRAWS = 2, 12  # variants of each kind, and draws, a plan
 PUSHES = 0.25  # share of the draws that push
 SHORT = (0.03, 0.3)  # share of its wire by which a pushed object falls short, about
@@ -65,6 +69,7 @@ LAST = 0.03  # share of a phase that is its wire's end
 AROUND, KICK = 0.01, 0.01  # [s] before and after an impact, and share of the speed by which it is off, that count
 RADIUS = 0.04  # of the objects, about [m]
 PLACES = 1001  # samples a phase
+SORTS = {"pausing": 50, "stopping": 20, "flying": 15}  # and how many of each by default
 UNDECIDED = {Status.AMBIGUOUS, Status.SINGULAR, Status.NO_CONVERGENCE, Status.MAX_STEPS}
 
 
@@ -103,7 +108,7 @@ def predict(scene: wa.Scene, torque: wa.Torque, traced) -> Predicted:
     known = next((k for k, (a, c) in enumerate(zip(states, lasts, strict=True)) if not (a and c)), len(states) - 1) + 1
     undecided = None in states[:known]
     failed = [[held.margin for held in phase.holds if held.lost is not None] for phase in result.phases]
-    margins = [min([phase.margin, *held]) for phase, held in zip(result.phases, failed, strict=True)]
+    margins = [min([np.inf if _rests(p) else p.margin, *held]) for p, held in zip(result.phases, failed, strict=True)]
     worst = int(np.argmin(margins[:known]))
     phase, course = result.phases[worst], courses[worst]
     return Predicted(
@@ -117,6 +122,11 @@ def predict(scene: wa.Scene, torque: wa.Torque, traced) -> Predicted:
         place=(phase.margin_time - phase.start) / max(float(course.time[-1] - phase.start), 1e-9),
         off=max(_off(*pair) for pair in zip(result.phases[:known], courses[:known], strict=True)),
     )
+
+
+def _rests(phase) -> bool:
+    """Whether a phase only holds the object."""
+    return phase.arrive == "hold"
 
 
 def _dip(course) -> float:
@@ -140,8 +150,8 @@ def _lasts(phase, course) -> bool:
 
 
 def _off(phase, course) -> float:
-    """How far from its wire's end a phase ends, over the tolerance."""
-    off = np.asarray(course.z[-1] - end_configuration(phase.traced))
+    """How far from where it should a phase ends, over the tolerance."""
+    off = np.asarray(course.z[-1] - destination(phase, phase.traced))
     return float(max(np.hypot(*off[:2]) / TOLERANCE.position, abs(off[2]) / TOLERANCE.angle))
 
 
@@ -164,6 +174,8 @@ def _arrives(phase, course) -> bool | None:
     if {ended, phase.status} & UNDECIDED:
         return None
     there = _off(phase, course) <= 1
+    if _rests(phase):
+        return there and phase.status in (Status.OK, Status.CONTACT_LOST)
     if phase.arrive == "moving":
         return None if ended is Status.OK and not there else there
     if there and (pace > HURRY or share < 1 - EARLY):
@@ -185,7 +197,7 @@ def spoiled(base: Predicted, rng: np.random.Generator) -> tuple[str, wa.Torque] 
     """A variant of the torques, and which kind it is; None where the drawn squeeze does not reach its aim."""
     torque, row_of = base.result.torque, _rows(base.result)
     change = np.zeros((len(torque.times), 2))
-    chosen = int(rng.integers(len(base.courses)))
+    chosen = int(rng.choice([k for k, phase in enumerate(base.result.phases) if not _rests(phase)]))
     rows = row_of == chosen
     course, table = base.courses[chosen], base.result.phases[chosen].traced.table
     s = np.interp(np.asarray(torque.times)[rows], course.time, course.s)
@@ -205,7 +217,7 @@ def spoiled(base: Predicted, rng: np.random.Generator) -> tuple[str, wa.Torque] 
 def _rows(result: Result) -> np.ndarray:
     """The phase that each row of a schedule belongs to, by when its phases begin."""
     times = np.asarray(result.torque.times)
-    if all(phase.arrive == "rest" for phase in result.phases):
+    if all(phase.arrive != "moving" for phase in result.phases):
         return np.arange(len(times)) // KNOTS
     return np.searchsorted([phase.start for phase in result.phases], times, side="right") - 1
 
@@ -246,6 +258,8 @@ def executed(predicted: Predicted, timestep: float = TIMESTEP) -> dict:
     done = execute(predicted.result, timestep=timestep, tolerance=TOLERANCE)
     free, which = 0.0, None
     for phase, course in zip(predicted.result.phases, predicted.courses, strict=True):
+        if _rests(phase):
+            continue
         begin, end = phase.start + MARGIN_OF_TIME, float(course.time[-1]) - MARGIN_OF_TIME
         inside = (done.course.time >= begin) & (done.course.time <= end)
         for name in phase.contacts:
@@ -256,7 +270,7 @@ def executed(predicted: Predicted, timestep: float = TIMESTEP) -> dict:
     errors = {"position_error": done.position_error, "angle_error": abs(done.angle_error)}
     found = {"holds": holds, "ending": done.ending.value, "free": free, "free_contact": which, **errors}
     changes = [phase.start for phase in predicted.result.phases if any(phase.impulses)]
-    stops = [phase for phase in predicted.result.phases[1:] if not any(phase.impulses)]
+    stops = [phase for phase in predicted.result.phases[1:] if not any(phase.impulses) and not _rests(phase)]
     found |= {"impact": max((_impact(done, when) for when in changes), default=0.0)}
     return found | {"restless": max((_restless(done, phase) for phase in stops), default=0.0)}
 
@@ -371,15 +385,24 @@ def _sensitive(predicted: Predicted) -> bool:
     return False
 
 
-def _plans(seed: int, stopping: int, flying: int) -> Iterator[tuple[str, wa.Scene]]:
-    """Plans of both kinds, mixed."""
-    left = {"stopping": stopping, "flying": flying}
-    found = {"stopping": stopping_plans(np.random.default_rng(seed), 2, 1.0)}
+def _plans(seed: int, wanted: dict[str, int]) -> Iterator[tuple[str, wa.Scene]]:
+    """Plans of all sorts, mixed; those that pause and those that stop are not the same."""
+    left = dict(wanted)
+    stopping = stopping_plans(np.random.default_rng(seed), 2, 1.0)
+    found = {"pausing": map(_paused, stopping), "stopping": stopping}
     found["flying"] = flying_plans(np.random.default_rng(seed), 3, 0.4)
     while any(left.values()):
-        kind = max(left, key=lambda kind: left[kind] / max({"stopping": stopping, "flying": flying}[kind], 1))
-        left[kind] -= 1
-        yield kind, next(found[kind])
+        sort = max(left, key=lambda sort: left[sort] / max(wanted[sort], 1))
+        left[sort] -= 1
+        yield sort, next(found[sort])
+
+
+def _paused(scene: wa.Scene) -> wa.Scene:
+    """The same plan, which holds the object for `PAUSE` before its last phase."""
+    data = to_dict(scene)
+    *before, last = data["phase"]
+    pause = {"name": "pause", "contacts": before[-1]["contacts"], "hold": True, "duration": PAUSE}
+    return wa.parse(data | {"phase": [*before, pause, last]})
 
 
 def study(scenes, seed: int, begun: float, note) -> tuple[list[dict], int]:
@@ -417,7 +440,7 @@ def summarise(rows: list[dict]) -> dict:
     strict_clear = [row for row in strict if abs(row["margin"]) > CLEAR * row["mean_force"]]
     by_sort = {
         f"{sort}, {name}": rate([row for row in some if row["plan"].startswith(sort)])
-        for sort in ("stopping", "flying")
+        for sort in SORTS
         for name, some in (("overall", rows), ("clear", clear))
     }
     classes = Counter(row["class"] for row in rows if "class" in row)
@@ -461,12 +484,12 @@ def draw(rows: list[dict]) -> plt.Figure:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--stopping", type=int, default=70, help="plans of two phases")
-    parser.add_argument("--flying", type=int, default=20, help="plans of three phases without a stop")
+    for sort, count in SORTS.items():
+        parser.add_argument(f"--{sort}", type=int, default=count, help=f"{sort} plans")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quick", action="store_true", help="a few plans; nothing is written")
     given = parser.parse_args()
-    stopping, flying = (3, 1) if given.quick else (given.stopping, given.flying)
+    wanted = {sort: 1 if given.quick else getattr(given, sort) for sort in SORTS}
     begun = time.perf_counter()
 
     def note(rows, left_out):
@@ -477,7 +500,7 @@ def main() -> None:
             draw(rows).savefig(RESULTS / "prediction.svg", bbox_inches="tight")
             plt.close("all")
 
-    rows, left_out = study(_plans(given.seed, stopping, flying), given.seed, begun, note)
+    rows, left_out = study(_plans(given.seed, wanted), given.seed, begun, note)
     note(rows, left_out)
     for name, value in summarise(rows).items():
         print(name, value)

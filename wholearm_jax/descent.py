@@ -44,7 +44,6 @@ LEAST = 0.05  # slack that a room starts with at least
 LONGEST = (0.1, 0.5)  # most that `s` and `v` at a knot may change in a step [lengths, lengths a duration]
 SHORTER = 0.25  # a step that leaves what can be simulated is taken again with this share of it
 SMALL = 1e-3  # a share of a step that is taken whatever becomes of the merit
-RISE = 0.01  # most that a step may raise the merit, as a share of the bound
 EDGE = 1e-3  # room below which the merit's logarithm goes on as its tangent
 JAMMED = 0.02  # share of a step, below which limits count as leaving no way: the temperature rises `WARMER` times
 WARMER = 3.0
@@ -250,7 +249,7 @@ class Descent(NamedTuple):
 
     `least` is each phase's smallest sampled force over its unit and `apart` the sum of the defects, both of the
     variables before the step (NaN where those were not kept). `reach` is the part of a step that is taken. `merit` is
-    that of the variables before the step at the temperature `hot`.
+    that of the variables before the step at the temperature `hot`, and `rise` the most by which the step may raise it.
     """
 
     p: Variables
@@ -261,6 +260,7 @@ class Descent(NamedTuple):
     least: Float[Array, "phases"]
     apart: Float[Array, ""]
     reach: Float[Array, ""]
+    rise: Float[Array, ""]
     merit: Float[Array, ""]
     hot: Float[Array, ""]
 
@@ -287,7 +287,8 @@ def begin(p: Variables, optimiser) -> Descent:
     """A descent before its first step."""
     zero, still = jnp.zeros(()), jax.tree.map(jnp.zeros_like, p)
     state = optimiser.init(ravel_pytree(p)[0])
-    return Descent(p, state, p, still, zero + 1, 0 * p.log_duration, zero, zero + 1, zero + jnp.inf, state.temperature)
+    never = zero + jnp.inf
+    return Descent(p, state, p, still, zero + 1, 0 * p.log_duration, zero, zero + 1, never, never, state.temperature)
 
 
 @Program
@@ -296,7 +297,7 @@ def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimis
     linear = linearise(d.p, tables, limits, how)
     at = linear.at
     sound = jnp.all(jnp.isfinite(at.room)) & jnp.all(jnp.isfinite(linear.defect))
-    better = merit(linear, d.hot, d.state.joining) <= d.merit + RISE
+    better = merit(linear, d.hot, d.state.joining) <= d.merit + d.rise
     least = jnp.where((at.weight > 0) & (linear.bears > 0), at.room, jnp.inf).min((1, 2))
     apart = _apart(linear)
 
@@ -305,7 +306,7 @@ def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimis
         way, state = optimiser.update(jnp.zeros_like(flat), d.state, flat, linear=linear)
         hot = d.state.temperature
         here = merit(linear, hot, state.joining)
-        return Descent(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart, d.reach, here, hot)
+        return Descent(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart, d.reach, d.rise, here, hot)
 
     def again():
         least, apart = (jnp.full_like(a, jnp.nan) for a in (d.least, d.apart))

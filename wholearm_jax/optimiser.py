@@ -298,9 +298,10 @@ def _descend(task: _Task, start: Variables, number: int, limits: Limits, method,
             return d.p, "the margin no longer improves", history
         if share < LOST:
             return d.p, "no step leads on", history
-        # Full steps may go round in a circle for ever, where knots pass kinks of the wire to and fro.
+        # Full steps may go round in a circle for ever, where knots pass kinks of the wire to and fro. They lead on
+        # faster than any that must lower the merit: only who circles is held to it.
         circling = count >= task.steps // 3 and apart > CLOSE
-        d = after._replace(reach=_HALF if circling else _ONE)
+        d = after._replace(reach=_HALF if circling else _ONE, rise=_RISE if circling else _FREE)
     return d.p, why, history
 
 
@@ -333,7 +334,7 @@ def _method(optimiser, phases: int):
 
 _ONE = np.ones(())
 _HOW = Integration()
-_HALF = np.full((), 0.5)
+_HALF, _RISE, _FREE = np.full((), 0.5), np.full((), 0.01), np.full((), np.inf)  # shares of a step, and of the bound
 CLOSE = 1e-5  # sum of the defects from which full steps close them
 LOST = 1e-6  # share of a step at which a descent gives up
 
