@@ -16,8 +16,9 @@ What counts, by the same tolerances on both sides:
   end left out), no impulse pulls, no hold is infeasible, and every phase ends within `TOLERANCE` (0.5 mm, 0.01 rad) of
   its wire's end;
 - *executed to hold*: `execution.execute` at 0.05 ms ends `ok` (within the same tolerance, the last contacts closed to
-  0.5 mm), and no contact of a formation was without force for `FREE` running, its phase's ends left out alike. Forces
-  while the object is held are not determined, and not judged.
+  0.5 mm), and no contact of a formation was without force for `FREE` running, its phase's ends left out alike.
+Forces of an object at rest are not determined, as friction may take any part of them: those of an object that is held,
+or slower than `SLOW` of its phase's mean speed, are judged on neither side.
 
 A prediction is *strict* where no force may be tensile at any moment; agreement is given for that as well.
 Disagreements are executed again with steps of a quarter, and contacts as much harder, and put into classes.
@@ -57,6 +58,7 @@ TOLERANCE = Tolerance()
 FREE = 5e-3  # [s] without force from which a contact counts as lost; shorter is chatter of the contact's softness
 MARGIN_OF_TIME = 0.02  # [s] at either end of a phase, while formations change, in which forces are not judged
 HURRY, EARLY = 0.1, 0.05  # speed over the mean speed, and share of the phase left, with which a wire's end is too early
+SLOW = 0.02  # speed over the mean speed below which an object counts as at rest
 PAUSE = 0.1  # [s] for which a pausing plan holds the object
 EACH, DRAWS = 2, 12  # variants of each kind, and draws, a plan
 PUSHES = 0.25  # share of the draws that push
@@ -67,7 +69,7 @@ NEAR = (0.5, 2.0)  # distances from the planned end, over the tolerance, that ar
 NUDGE = 1e-3  # change of all torques that moves the end of a sensitive plan by more than the tolerance
 LAST = 0.03  # share of a phase that is its wire's end
 AROUND, KICK = 0.01, 0.01  # [s] before and after an impact, and share of the speed by which it is off, that count
-RADIUS = 0.04  # of the objects, about [m]
+UNIT = np.array([0.04, 0.04, 1.0, 1.0, 1.0])  # of configurations: the objects' radius, about [m], and radians
 PLACES = 1001  # samples a phase
 SORTS = {"pausing": 50, "stopping": 20, "flying": 15}  # and how many of each by default
 UNDECIDED = {Status.AMBIGUOUS, Status.SINGULAR, Status.NO_CONVERGENCE, Status.MAX_STEPS}
@@ -118,7 +120,7 @@ def predict(scene: wa.Scene, torque: wa.Torque, traced) -> Predicted:
         strict=None if undecided else all(states) and all(bears),
         margin=margins[worst],
         mean=float(np.nanmean(np.concatenate([c.cn.ravel() for c in courses[:known]]))),
-        dip=max(_dip(course) for course in courses[:known]),
+        dip=max(_dip(*pair) for pair in zip(result.phases[:known], courses[:known], strict=True)),
         place=(phase.margin_time - phase.start) / max(float(course.time[-1] - phase.start), 1e-9),
         off=max(_off(*pair) for pair in zip(result.phases[:known], courses[:known], strict=True)),
     )
@@ -129,12 +131,24 @@ def _rests(phase) -> bool:
     return phase.arrive == "hold"
 
 
-def _dip(course) -> float:
+def _dip(phase, course) -> float:
     """The longest time [s] for which one of a phase's forces is tensile where executed ones are judged as well."""
-    begin, end = course.time[0] + MARGIN_OF_TIME, course.time[-1] - MARGIN_OF_TIME
-    cn = course.cn[(course.time >= begin) & (course.time <= end)]
+    judged = _judged(phase, course, course)
     step = float(course.time[1] - course.time[0])
-    return max(_longest(cn[:, k] < 0) for k in range(cn.shape[1])) * step
+    return max(_longest(judged & (cn < 0)) for cn in course.cn.T) * step
+
+
+def _judged(phase, course, of) -> np.ndarray:
+    """When forces of a phase are judged, in a course `of` it, `course` being the predicted one."""
+    begin, end = course.time[0] + MARGIN_OF_TIME, course.time[-1] - MARGIN_OF_TIME
+    moves = np.linalg.norm(of.z_dot / UNIT, axis=1) > SLOW * _pace(phase)
+    return (of.time >= begin) & (of.time <= end) & moves & (not _rests(phase))
+
+
+def _pace(phase) -> float:
+    """The mean speed of a phase [1/s]."""
+    way = np.asarray(end_configuration(phase.traced)) - np.asarray(start_configuration(phase.traced.table))
+    return float(np.linalg.norm(way / UNIT) / phase.duration)
 
 
 def _bears(phase) -> bool:
@@ -146,7 +160,7 @@ def _lasts(phase, course) -> bool:
     """Whether no contact of a phase would have to pull for `FREE` or longer, while formations do not change."""
     pulls = bool(phase.impulses) and min(phase.impulses) < 0
     refused = pulls or any(held.lost is not None for held in phase.holds)
-    return _bears(phase) or (phase.status is Status.CONTACT_LOST and not refused and _dip(course) < FREE)
+    return _bears(phase) or (phase.status is Status.CONTACT_LOST and not refused and _dip(phase, course) < FREE)
 
 
 def _off(phase, course) -> float:
@@ -258,12 +272,9 @@ def executed(predicted: Predicted, timestep: float = TIMESTEP) -> dict:
     done = execute(predicted.result, timestep=timestep, tolerance=TOLERANCE)
     free, which = 0.0, None
     for phase, course in zip(predicted.result.phases, predicted.courses, strict=True):
-        if _rests(phase):
-            continue
-        begin, end = phase.start + MARGIN_OF_TIME, float(course.time[-1]) - MARGIN_OF_TIME
-        inside = (done.course.time >= begin) & (done.course.time <= end)
+        judged = _judged(phase, course, done.course)
         for name in phase.contacts:
-            longest = _longest(done.course.cn[inside, done.names.index(name)] <= 0) * done.timestep
+            longest = _longest(judged & (done.course.cn[:, done.names.index(name)] <= 0)) * done.timestep
             if longest > free:
                 free, which = longest, name
     holds = done.ending is Ending.OK and free < FREE
@@ -278,9 +289,7 @@ def executed(predicted: Predicted, timestep: float = TIMESTEP) -> dict:
 def _restless(done, phase) -> float:
     """How fast an executed object moves where it should set out from rest, beyond the prediction, in mean speeds."""
     moves, should = _speeds(done, phase.start + AROUND)
-    way = np.asarray(end_configuration(phase.traced)) - np.asarray(start_configuration(phase.traced.table))
-    unit = np.array([RADIUS, RADIUS, 1.0, 1.0, 1.0])
-    return float(np.linalg.norm((moves - should) / unit) / np.linalg.norm(way / unit) * phase.duration)
+    return float(np.linalg.norm((moves - should) / UNIT) / _pace(phase))
 
 
 def _impact(done, when: float) -> float:

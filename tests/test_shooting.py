@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
+from wholearm_jax import squeeze
 from wholearm_jax.descent import moved
+from wholearm_jax.forces import arcs, on_arc
 from wholearm_jax.linearisation import Limits
 from wholearm_jax.motion import move
 from wholearm_jax.plan import trace
@@ -46,6 +48,26 @@ def test_an_interval_crosses_a_reversal_as_the_simulation_does(flip):
     s_end = (motion.s[motion.count] - flip.breaks[0]) / flip.length
     v_end = motion.w[motion.count] / duration / flip.length
     np.testing.assert_allclose(shot.end, [s_end, v_end], rtol=1e-9)
+
+
+def test_paces_bound_the_speed_between_knots(flip):
+    """An interval that goes forward at both ends and backward between them shows it."""
+    intervals, speed, brake = 50, 1e-3, 4.0
+    s, v = flip.breaks[0] + 0.3 * flip.length, speed * flip.length
+    torque = [squeeze.hold(flip, s, v, a).torque / flip.torque_limit for a in (-brake, brake)]
+    q = jnp.concatenate([jnp.array([0.3, speed]), *torque, jnp.zeros(1)])
+    shot = shoot(flip, HOW, intervals, q)
+    seen = window(wa.torque([0.0, 1 / intervals], q[2:6].reshape(2, 2) * flip.torque_limit), 0.0, 1 / intervals)
+    motion = move(flip, seen, jnp.asarray(1 / intervals), how=Integration(tolerance=1e-12), s=s, speed=v, free=True)
+    steps = arcs(flip, seen, 1 / intervals, motion)
+    places = jnp.linspace(0.0, 1.0, 101)
+    each = jax.vmap(lambda k: jax.vmap(lambda xi: on_arc(jax.tree.map(lambda a: a[k], steps), xi)[2])(places))
+    speeds = np.asarray(each(np.arange(int(motion.count)))) * intervals / float(flip.length)
+    assert speeds[0, 0] == pytest.approx(speed)
+    assert float(shot.end[1]) > 0 > speeds.min()
+    bound = float(shot.pace[shot.pace_weight > 0].min())
+    assert speeds.min() - 0.2 * np.ptp(speeds) < bound < speeds.min()
+    np.testing.assert_allclose(shot.pace_weight.sum(), 1 / intervals)
 
 
 def test_derivatives_of_an_interval_that_is_cut(flip):

@@ -12,8 +12,9 @@ curvature of the simulation itself is left out (Gauss-Newton). It is an optax gr
 optax optimiser may take its place (`projected`).
 
 A step follows the curve on which accelerations and squeezes at the knots change evenly (`moved`): on it the intervals
-are nearly linear. One that raises the loss, with a penalty on `|e|`, is taken again with a part of its length; and
-where limits leave only tiny steps, the temperature rises again, and stays above the one at which that happened.
+are nearly linear. One that raises the loss, with a penalty on `|e|`, by more than a descent's `rise` is taken again
+with a part of its length; and where limits leave only tiny steps, the temperature rises again, and stays above the one
+at which that happened.
 Source of the interior point and of the penalty: J. Nocedal and S. J. Wright, Numerical Optimization, 2006, chapters 18
 and 19.
 
@@ -34,7 +35,7 @@ from wholearm_jax.forces import smooth_margin
 from wholearm_jax.linearisation import Limits, Linear, change_of_rooms, gather, linearise, metric
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Table
-from wholearm_jax.shooting import PARTS, ROWS, SAMPLES, STEPS, Variables
+from wholearm_jax.shooting import PACES, PARTS, ROWS, SAMPLES, STEPS, Variables
 from wholearm_jax.squeeze import coefficients
 from wholearm_jax.stepping import Integration
 
@@ -70,7 +71,7 @@ def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
 
     def init(params):
         knots = (params.shape[0] // phases - 1) // 4
-        shape = (phases, knots - 1, PARTS * STEPS * SAMPLES * ROWS + 8 + 4 + STEPS + 2)
+        shape = (phases, knots - 1, PARTS * STEPS * (SAMPLES * ROWS + PACES) + 8 + 4 + 2)
         level, hot, cold = (jnp.full((), value) for value in (jnp.nan, HOTTEST, COLDEST))
         return Duals(jnp.ones(shape), jnp.zeros(shape), level, hot, cold, jnp.zeros(2), jnp.zeros(()))
 

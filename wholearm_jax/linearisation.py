@@ -66,7 +66,7 @@ def rooms(q: Float[Array, "7"], later, unit, table: Table, limits: Limits, how, 
     one = jnp.full((), 1 / intervals)
     sampled = (shot.weight[:, None] * ~spare(table)).ravel()
     climbs = jnp.tile(jnp.where(bounded, one / 4, 0.0), 2)
-    paces = jnp.full(STEPS, one).at[0].multiply(later)
+    paces = shot.pace_weight.at[0].multiply(later)
     weight = [sampled, jnp.full(8, one / 4), climbs, paces, jnp.full(2, jnp.where(free, one / 4, 0.0))]
     return Rooms(jnp.concatenate(room), jnp.concatenate(weight), shot.end)
 

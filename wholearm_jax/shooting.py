@@ -16,11 +16,13 @@ problems, IFAC World Congress 1984.
 Derivation: section 9 of `docs/derivation.md`.
 """
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
@@ -34,6 +36,7 @@ STEPS = 2  # solver steps an interval (and a part of it, where it is cut)
 ROWS = 4 + MOST_ROLLING  # slacks a sample
 SAMPLES = 5  # places in a step at which forces are sampled, its ends included
 PARTS = 3  # pieces of the wire that one interval may touch
+PACES = 4  # numbers a step that bound its speed from below
 LANDINGS = 30  # most Newton steps to the place where an interval is cut
 LANDED = 1e-8  # size of the last one; what is left is taken to first order, an error of its square
 
@@ -50,12 +53,13 @@ class Variables(eqx.Module):
 
 class Shot(NamedTuple):
     """Intervals simulated: forces' slacks [N] (`forces.linear_slacks`) at every sample, the sample's share of the phase
-    (0: none), the speed at the interval's start and inside it in wire lengths a duration, and the state at its end as
-    in `Variables`."""
+    (0: none), speeds (`_paces`) in wire lengths a duration with their shares, and the state at its end as in
+    `Variables`."""
 
     forces: Float[Array, "*intervals samples rows"]
     weight: Float[Array, "*intervals samples"]
-    pace: Float[Array, "*intervals steps"]
+    pace: Float[Array, "*intervals paces"]
+    pace_weight: Float[Array, "*intervals paces"]
     end: Float[Array, "*intervals 2"]
 
 
@@ -116,14 +120,29 @@ def shoot(table: Table, how: Integration, intervals: int, q: Float[Array, "7"]) 
     done = jax.lax.while_loop(lambda at: (at.share < 1) & (at.count < PARTS), one_part, begin)
     steps = _arcs(table, seen, duration, done)
     forces = sampled_slacks(table, seen, duration, steps, SAMPLES, linear_slacks).reshape(PARTS * STEPS * SAMPLES, -1)
-    weight = jnp.repeat((done.when[:, -1] - done.when[:, 0]) / (STEPS * SAMPLES * intervals), STEPS * SAMPLES)
+    span = (done.when[:, -1] - done.when[:, 0]) / (STEPS * intervals)
+    weight, pace_weight = (jnp.repeat(span / each, STEPS * each) for each in (SAMPLES, PACES))
     y = jnp.where(done.share < 1, jnp.nan, done.y)
     return Shot(
         forces=jnp.where(weight[:, None] > 0, forces, 0.0),
         weight=stop_gradient(weight),
-        pace=done.place[0, :-1, 1] / per_interval,
+        pace=_paces(steps) / per_interval,
+        pace_weight=stop_gradient(pace_weight),
         end=jnp.stack([(y[0] - table.breaks[0]) / table.length, y[1] / per_interval]),
     )
+
+
+def _paces(steps: Arcs) -> Float[Array, "paces"]:
+    """What bounds the speed within each step from below: while all are positive, it is nowhere less than the least.
+
+    They are the coefficients, but the last, of `ds/dxi` by Bernstein's polynomials: the first is the speed at the
+    step's start, the last that at the next one's. Speeds at some places alone would let it fall below zero between
+    them, where an honest simulation stops.
+    """
+    width = steps.share[:, 1] - steps.share[:, 0]
+    basis = np.array([[math.comb(i, j) / math.comb(4, j) for j in range(5)] for i in range(PACES)])
+    slopes = (steps.quintic[:, 1:] * jnp.arange(1.0, 6.0)) @ basis.T
+    return jnp.where(steps.live[:, None], slopes / jnp.where(steps.live, width, 1.0)[:, None], 1.0).ravel()
 
 
 def _arcs(table, seen, duration, done: _Parts) -> Arcs:
