@@ -9,10 +9,12 @@ import wholearm_jax as wa
 from wholearm_jax import optimiser
 from wholearm_jax.execution import Ending, execute
 from wholearm_jax.holding import statics, watch
-from wholearm_jax.phase import balance_at_start, end_configuration, start_configuration
+from wholearm_jax.phase import balance_at_start, end_configuration, run, start_configuration
 from wholearm_jax.result_file import summary
 from wholearm_jax.scene_file import to_dict
+from wholearm_jax.schedule import padded
 from wholearm_jax.squeeze import hold
+from wholearm_jax.stepping import Integration
 
 HALF, MASS, MU, DRY, LIMIT = 0.03, 0.2, 0.3, 0.01, 1.0
 WEIGHT, HEIGHT = MASS * 9.81, 2 * HALF
@@ -145,6 +147,22 @@ def test_executed_on_free_bodies(optimised):
     end = end_configuration(optimised.result.phases[0].traced)
     off = done.course.z[at_rest, :2] - np.asarray(end)[:2]
     assert np.hypot(*off.T).max() < 5e-4
+
+
+@pytest.mark.parametrize("length", [-6e-15, 0.0, 6e-15])
+def test_an_object_is_held_where_its_wire_ends(optimised, length):
+    """The wire of a hold at the end of the phase before it has no length but rounding, of either sign."""
+    pause = optimised.result.phases[1]
+    table = pause.traced.table
+    breaks = table.breaks.at[1:].set(table.breaks[0] + length)
+    table = eqx.tree_at(lambda t: t.breaks, table, breaks)
+    found = run(table, padded(optimised.torque), pause.start, pause.duration, Integration(), "hold")
+    motion = found.motion
+    assert wa.Status(int(motion.status)) is wa.Status.STUCK
+    assert (int(motion.count), bool(motion.held[0])) == (1, True)
+    np.testing.assert_array_equal(motion.share[:2], [0.0, 1.0])
+    for values in (motion.s, motion.w):
+        np.testing.assert_array_equal(values, np.full_like(values, values[0]))
 
 
 def changed_pause(found, factors):

@@ -147,7 +147,9 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     final = jnp.where(blocked, state.share, 1.0)
 
     solution = _integrate(table, seen, duration, how, state, final, goal, floor)
-    state, complete, overshot, last_time = _recorded(state, solution, room)
+    # A wire that ends where the object rests, as one that only holds may, is passed by nothing that stays there.
+    overshot = dfx.is_event(solution.result) & ~blocked
+    state, complete, last_time = _recorded(state, solution, overshot, room)
     node = state.share, state.s, state.w
     landed = land(table, seen, duration, how, state.piece, node, last_time, goal, floor, overshot)
     land_share, land_s, land_w, passed, astray = landed
@@ -186,16 +188,15 @@ def _wait(table, seen, how, free, state: _State):
     return state._replace(share=share), verdict, room
 
 
-def _recorded(state: _State, solution, room):
-    """Record a solution's steps but one that overshoots: the state after them, whether the record holds them all,
-    whether one overshoots, and when that one ends."""
+def _recorded(state: _State, solution, overshot, room):
+    """Record a solution's steps but the last one where it `overshot`: the state after them, whether the record holds
+    them all, and when the one that overshoots ends."""
     capacity = state.entry_w.shape[0]
     y0 = jnp.stack([state.s, state.w])
     saved_times, saved = jnp.asarray(solution.ts), jnp.asarray(solution.ys)
     taken = solution.stats["num_accepted_steps"]
-    overshot = dfx.is_event(solution.result)
     # The record is as long as one stage may be; several stages together may need more.
-    complete = (dfx.is_successful(solution.result) | overshot) & (taken <= room)
+    complete = (dfx.is_successful(solution.result) | dfx.is_event(solution.result)) & (taken <= room)
     rows = jnp.arange(capacity)
     kept = jnp.clip(jnp.where(overshot, taken - 1, taken), 0, jnp.maximum(room, 0))
     live = rows < kept
@@ -216,7 +217,7 @@ def _recorded(state: _State, solution, room):
         pieces=state.pieces.at[place - 1].set(state.piece, mode="drop"),
         count=start + kept,
     )
-    return state, complete, overshot, jnp.where(overshot, saved_times[jnp.maximum(taken - 1, 0)], 1.0)
+    return state, complete, jnp.where(overshot, saved_times[jnp.maximum(taken - 1, 0)], 1.0)
 
 
 def _integrate(table, seen, duration, how, state, final, goal, floor):
