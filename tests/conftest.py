@@ -1,6 +1,5 @@
-"""Every test computes in 64 bits, compiles as quickly as XLA can, and leaves room for those that follow."""
+"""Every test computes in 64 bits, compiles as the command line does, and leaves room for those that follow."""
 
-import os
 import sys
 from pathlib import Path
 
@@ -12,15 +11,19 @@ from wholearm_jax import command
 MAPPED = 30_000  # half of the memory areas that Linux grants a process by default
 
 jax.config.update("jax_enable_x64", True)
-if "XLA_FLAGS" not in os.environ:  # most of the suite's time is compiling: no optimisation spares a third of it
-    os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=0"
 command.compile_quickly()
 
 
 def pytest_collection_modifyitems(items):
-    """Notebooks find the programs that other tests have compiled; the many short tests are shared out at the end."""
-    late = ("test_notebooks", "test_scene_file")
-    items.sort(key=lambda item: next((k for k, name in enumerate(late, 1) if name in item.nodeid), 0))
+    """Tests of derivatives, which compile longest, one after the other: each worker takes a run of tests, and what it
+    has compiled it has. Notebooks late, when others have compiled their programs; the many short ones at the end."""
+
+    def place(item):
+        late = ("test_notebooks", "test_scene_file")
+        derived = any(word in item.nodeid for word in ("gradient", "derivatives"))
+        return -1 if derived else next((k for k, name in enumerate(late, 1) if name in item.nodeid), 0)
+
+    items.sort(key=place)
 
 
 @pytest.fixture(autouse=True, scope="session")
