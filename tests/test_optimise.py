@@ -128,6 +128,28 @@ HARD = {
         {"contacts": ["palm:v0", "palm:v6", "finger1:v1", "finger2:v4"], "toward": "theta1+", "duration": 1.0},
         0.99,
     ),
+    # Steps are long along ways that the loss hardly sees: its intervals never join where those have no price.
+    "circles where little is at stake": (
+        [
+            [0.0335, 0.0223, 0.001, -0.0265, -0.0285, -0.0116, 0.0298],
+            [0.0094, 0.0314, 0.0327, 0.021, -0.0183, -0.0332, -0.027],
+        ],
+        (0.27, 0.17),
+        (0.06611, 0.03291, -3.08064, 0.68494, 0.45832),
+        {"contacts": ["palm:v1", "palm:v2", "finger1:v3", "finger2:v6"], "toward": "x-", "duration": 1.0},
+        0.99,
+    ),
+    # It rests at its end for the last 1e-12 of its time, with torques that brake but cannot hold it.
+    "rests by rounding": (
+        [
+            [0.0342, 0.0243, -0.0158, -0.0282, -0.0295, -0.0105, 0.0308],
+            [-0.008, 0.023, 0.0275, 0.0164, -0.0118, -0.036, -0.0246],
+        ],
+        (0.26, 0.13),
+        (0.03775, 0.03321, -1.36877, 1.84758, 0.5401),
+        {"contacts": ["palm:v6", "palm:v0", "finger1:v2", "finger2:v4"], "toward": "x-", "duration": 1.0},
+        0.99,
+    ),
 }
 
 

@@ -75,7 +75,7 @@ def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
         level, hot, cold = (jnp.full((), value) for value in (jnp.nan, HOTTEST, COLDEST))
         return Duals(jnp.ones(shape), jnp.zeros(shape), level, hot, cold, jnp.zeros(2), jnp.zeros(()))
 
-    def update(updates, state: Duals, params=None, *, linear: Linear, **_):
+    def update(updates, state: Duals, params=None, *, linear: Linear, damping, **_):
         at, bears, hot = linear.at, linear.bears, state.temperature
         live = at.weight > 0
         least = jnp.where(live & (bears > 0), at.room, jnp.inf).min()
@@ -88,7 +88,7 @@ def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
         stiff = price / slack
         miss = given - slack
         aim = jnp.where(live, target - stiff * miss, 0.0)
-        way, rise, forces = _solve(linear, stiff, aim)
+        way, rise, forces = _solve(linear, stiff, aim, damping)
         dslack = change_of_rooms(linear, way) - bears * rise + miss
         dslack = jnp.where(live, dslack, 0.0)
         dprice = jnp.where(live, target - price - stiff * dslack, 0.0)
@@ -112,13 +112,16 @@ def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
 
 
-def _solve(linear: Linear, stiff, aim):
-    """The step of `p` and of the margin's level, and the prices of joining the intervals: one symmetric system."""
+def _solve(linear: Linear, stiff, aim, damping):
+    """The step of `p` and of the margin's level, and the prices of joining the intervals: one symmetric system.
+
+    `damping` is a price of the step's size: it keeps steps small along ways that the loss hardly sees.
+    """
     bears, across = linear.bears, jnp.where(linear.still | linear.loose[:, None], 0.0, linear.across)
     e, n = across.shape
     lean = gather(linear, stiff * bears)
     matrix = jnp.zeros((n + 1 + e, n + 1 + e))
-    matrix = matrix.at[:n, :n].set(metric(linear, stiff)).at[n, n].set((stiff * bears).sum())
+    matrix = matrix.at[:n, :n].set(metric(linear, stiff) + damping * jnp.eye(n)).at[n, n].set((stiff * bears).sum())
     matrix = matrix.at[:n, n].set(-lean).at[n, :n].set(-lean)
     matrix = matrix.at[:n, n + 1 :].set(across.T).at[n + 1 :, :n].set(across)
     matrix = matrix.at[n + 1 :, n + 1 :].set(-jnp.diag(1.0 * linear.loose))
@@ -250,7 +253,8 @@ class Descent(NamedTuple):
 
     `least` is each phase's smallest sampled force over its unit and `apart` the sum of the defects, both of the
     variables before the step (NaN where those were not kept). `reach` is the part of a step that is taken. `merit` is
-    that of the variables before the step at the temperature `hot`, and `rise` the most by which the step may raise it.
+    that of the variables before the step at the temperature `hot`, and `rise` the most by which the step may raise it;
+    `damping` the price of the step's size (of the interior point's).
     """
 
     p: Variables
@@ -262,6 +266,7 @@ class Descent(NamedTuple):
     apart: Float[Array, ""]
     reach: Float[Array, ""]
     rise: Float[Array, ""]
+    damping: Float[Array, ""]
     merit: Float[Array, ""]
     hot: Float[Array, ""]
 
@@ -289,7 +294,8 @@ def begin(p: Variables, optimiser) -> Descent:
     zero, still = jnp.zeros(()), jax.tree.map(jnp.zeros_like, p)
     state = optimiser.init(ravel_pytree(p)[0])
     never = zero + jnp.inf
-    return Descent(p, state, p, still, zero + 1, 0 * p.log_duration, zero, zero + 1, never, never, state.temperature)
+    least = 0 * p.log_duration
+    return Descent(p, state, p, still, zero + 1, least, zero, zero + 1, never, zero, never, state.temperature)
 
 
 @Program
@@ -304,10 +310,10 @@ def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimis
 
     def onward():
         flat, unravel = ravel_pytree(d.p)
-        way, state = optimiser.update(jnp.zeros_like(flat), d.state, flat, linear=linear)
+        way, state = optimiser.update(jnp.zeros_like(flat), d.state, flat, linear=linear, damping=d.damping)
         hot = d.state.temperature
         here = merit(linear, hot, state.joining)
-        return Descent(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart, d.reach, d.rise, here, hot)
+        return Descent(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart, d.reach, d.rise, d.damping, here, hot)
 
     def again():
         least, apart = (jnp.full_like(a, jnp.nan) for a in (d.least, d.apart))

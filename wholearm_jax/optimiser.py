@@ -281,7 +281,7 @@ def _optimise_group(
 def _descend(task: _Task, start: Variables, number: int, limits: Limits, method, callback):
     """One descent: the variables at its end, why it ended, and its steps."""
     tables, history = task.tables, []
-    d = begin(start, method)
+    d, rounds = begin(start, method), 0
     why = f"the limit of {task.steps} steps"
     for count in range(task.steps):
         begun = time.perf_counter()
@@ -298,11 +298,18 @@ def _descend(task: _Task, start: Variables, number: int, limits: Limits, method,
             return d.p, "the margin no longer improves", history
         if share < LOST:
             return d.p, "no step leads on", history
-        # Full steps may go round in a circle for ever, where knots pass kinks of the wire to and fro. They lead on
-        # faster than any that must lower the merit: only who circles is held to it.
+        # Full steps lead on fastest, but may go round in a circle for ever: where knots pass kinks of the wire to and
+        # fro, and along ways that the loss hardly sees. Who circles is held back, more and more.
         circling = count >= task.steps // 3 and apart > CLOSE
-        d = after._replace(reach=_HALF if circling else _ONE, rise=_RISE if circling else _FREE)
+        rounds += circling
+        d = after._replace(**(_held_back(rounds) if circling else _FULL))
     return d.p, why, history
+
+
+def _held_back(rounds: int) -> dict[str, np.ndarray]:
+    """How far steps go after so many that circled."""
+    settings = {"reach": 0.5, "rise": RISE, "damping": DAMPING * DAMPED**rounds}
+    return {name: np.full((), value) for name, value in settings.items()}
 
 
 @functools.cache
@@ -334,7 +341,9 @@ def _method(optimiser, phases: int):
 
 _ONE = np.ones(())
 _HOW = Integration()
-_HALF, _RISE, _FREE = np.full((), 0.5), np.full((), 0.01), np.full((), np.inf)  # shares of a step, and of the bound
+_FULL = {"reach": _ONE, "rise": np.full((), np.inf), "damping": np.zeros(())}
+RISE = 0.01  # most that a step which is held back may raise the merit, as a share of the bound
+DAMPING, DAMPED = 1e-8, 1.3  # price of its size, and by how much that grows from one such step to the next
 CLOSE = 1e-5  # sum of the defects from which full steps close them
 LOST = 1e-6  # share of a step at which a descent gives up
 

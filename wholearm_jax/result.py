@@ -15,6 +15,7 @@ from wholearm_jax.schedule import Torque
 from wholearm_jax.status import Status
 
 SLIPPING = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
+BRIEF = 1e-9  # share of a phase: an object that comes to rest at its end does so earlier or later by rounding
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ def stays(scene: Scene, torque: Torque, phase: Phase, traced: Traced, outcome: O
         return ()
     start, duration = float(outcome.start), float(outcome.duration)
     found = []
-    for k in np.flatnonzero(motion.held[: int(motion.count)]):
+    for k in np.flatnonzero(motion.held[: int(motion.count)] & (np.diff(motion.share)[: int(motion.count)] > BRIEF)):
         z = configuration(traced.table, motion.piece[k], motion.s[k])
         begin, end = (start + duration * float(share) for share in motion.share[k : k + 2])
         found.append(watch(statics(scene, phase.formation, z), torque, begin, end))
