@@ -38,7 +38,7 @@ def test_both_modes_agree_with_differences(rows, expected):
 
     exact = float((slope * way).sum())
     assert abs(exact) > 1e-4
-    assert exact == pytest.approx(nearest_difference(along, exact), rel=1e-4)
+    assert exact == pytest.approx(nearest_difference(along, exact), rel=1e-7)
 
 
 def test_who_arrives_early_in_a_batch_keeps_its_gradient():

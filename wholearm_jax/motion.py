@@ -247,7 +247,7 @@ def _integrate(table, seen, duration, how, state, final, goal, floor):
 
     inputs = (table, seen, duration, state.share, jnp.stack([state.s, state.w]), final, goal)
     way, knots = stop_gradient(goal - state.s), seen.share
-    if how.adjoint in ("none", "forward"):
+    if how.adjoint == "none":
         return solve(inputs, adaptive(how, way, knots), how.adjoint)
     ends = solve(stop_gradient(inputs), adaptive(how, way, stop_gradient(knots)), "none").ts
     assert ends is not None

@@ -21,9 +21,10 @@ class Integration(eqx.Module):
     """How to integrate: diffrax solver, error `tolerance` a step (relative, of the wire's scale), limits, adjoint.
 
     `steps` says that the torque schedule has steps inside the phase. `adjoint` says what the solve will be
-    differentiated by: `"none"`, `"forward"`, `"reverse"` or `"both"`. Where reverse mode is wanted, the steps are found
-    once by the adaptive controller and taken again as they are: differentiating saved steps through rejected ones in
-    reverse mode gives wrong derivatives (seen with diffrax 0.7.2), and the repetition has none. All but a `tolerance`
+    differentiated by: `"none"`, `"forward"`, `"reverse"` or `"both"`. For all but the first the steps are found
+    once by the adaptive controller and taken again as they are. Differentiating saved steps through rejected ones in
+    reverse mode gives wrong derivatives (seen with diffrax 0.7.2), and forward mode through the controller erratic ones
+    (off by up to 3 % at any tolerance). All but a `tolerance`
     that is an array is static: each choice is a program of its own. The package's own programs get theirs as data.
     """
 
