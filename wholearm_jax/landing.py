@@ -4,7 +4,6 @@ Derivation: section 6 of `docs/derivation.md`.
 """
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
@@ -12,7 +11,7 @@ from jax.lax import stop_gradient
 from wholearm_jax.precision import digits
 from wholearm_jax.reduction import Table, horner, powers
 from wholearm_jax.schedule import Window, interval, torque_in
-from wholearm_jax.stepping import Integration
+from wholearm_jax.stepping import Integration, solver_of
 
 LANDINGS = 40  # at most so many Newton steps, or halvings, to the place where a stage ends
 
@@ -29,7 +28,7 @@ def acceleration(table: Table, seen: Window, duration, piece, row, share, s, w):
 @jax.jit
 def single_step(table, seen, duration, how: Integration, piece, row, share, y, length):
     """One step of the solver from `y = (s, w)` at a share of the phase, within a piece and a torque interval."""
-    solver = eqx.tree_at(lambda x: x.scan_kind, how.solver, "bounded", is_leaf=lambda x: x is None)
+    solver = solver_of(how)
 
     def field(u, y, args):
         table, seen, duration = args

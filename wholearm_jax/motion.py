@@ -1,12 +1,12 @@
-r"""Simulate: one phase as a scalar second-order ODE along its wire, integrated by diffrax.
+r"""Simulate: one phase as a scalar second-order ODE along its wire, integrated by diffrax's solvers.
 
 Time runs as a share `u` of the phase's duration `T`, and `w = v T` is the speed in `s` per duration, so that steps and
 tolerances mean the same for every size and duration:
 
     ds/du = w,    dw/du = T^2 (A0 + A3 tau1 + A4 tau2) + T A2 w + A1 w^2
 
-with the coefficients of `reduction.Table`. A phase is a sequence of smooth stages. Each stage is one `diffeqsolve`
-whose steps end on the torque's knots; it stops at the first step that leaves the piece or turns the speed negative.
+with the coefficients of `reduction.Table`. A phase is a sequence of smooth stages. Each stage is a run of steps
+that end on the torque's knots; it stops at the first step that leaves the piece or turns the speed negative.
 That step is then taken again with the length that lands exactly on the piece's end, or on rest, so that the method
 keeps its order across slip reversals and the landing carries its own derivatives.
 
@@ -18,7 +18,6 @@ Derivation: section 6 of `docs/derivation.md`.
 
 from typing import NamedTuple
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,7 +28,7 @@ from wholearm_jax.landing import acceleration, land
 from wholearm_jax.reduction import Table, horner, powers
 from wholearm_jax.schedule import Window, interval, torque_in
 from wholearm_jax.status import Status
-from wholearm_jax.stepping import ADJOINTS, Integration, adaptive, repeated
+from wholearm_jax.stepping import Integration, Steps, found, repeated
 
 
 class Motion(eqx.Module):
@@ -146,10 +145,9 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     floor = jnp.where(free, -jnp.inf, 0.0)
     final = jnp.where(blocked, state.share, 1.0)
 
-    solution = _integrate(table, seen, duration, how, state, final, goal, floor)
-    # A wire that ends where the object rests, as one that only holds may, is passed by nothing that stays there.
-    overshot = dfx.is_event(solution.result) & ~blocked
-    state, complete, last_time = _recorded(state, solution, overshot, room)
+    steps = _integrate(table, seen, duration, how, state, final, goal, floor)
+    overshot = steps.passed
+    state, complete, last_time = _recorded(state, steps, overshot, room)
     node = state.share, state.s, state.w
     landed = land(table, seen, duration, how, state.piece, node, last_time, goal, floor, overshot)
     land_share, land_s, land_w, passed, astray = landed
@@ -188,25 +186,20 @@ def _wait(table, seen, how, free, state: _State):
     return state._replace(share=share), verdict, room
 
 
-def _recorded(state: _State, solution, overshot, room):
-    """Record a solution's steps but the last one where it `overshot`: the state after them, whether the record holds
-    them all, and when the one that overshoots ends."""
+def _recorded(state: _State, steps: Steps, overshot, room):
+    """Record steps but the last one where it `overshot`: the state after them, whether the record holds them all, and
+    when the one that overshoots ends."""
     capacity = state.entry_w.shape[0]
     y0 = jnp.stack([state.s, state.w])
-    saved_times, saved = jnp.asarray(solution.ts), jnp.asarray(solution.ys)
-    taken = solution.stats["num_accepted_steps"]
     # The record is as long as one stage may be; several stages together may need more.
-    complete = (dfx.is_successful(solution.result) | dfx.is_event(solution.result)) & (taken <= room)
+    complete = steps.complete & (steps.count <= room)
     rows = jnp.arange(capacity)
-    kept = jnp.clip(jnp.where(overshot, taken - 1, taken), 0, jnp.maximum(room, 0))
-    live = rows < kept
-    # Unused rows are infinite: put numbers there before anything is computed from them.
-    times = jnp.where(live, saved_times, state.share)
-    steps = jnp.where(live[:, None], saved, y0)
+    kept = jnp.clip(jnp.where(overshot, steps.count - 1, steps.count), 0, jnp.maximum(room, 0))
     start = state.count
-    place = jnp.where(live, start + 1 + rows, capacity + 1)
-    nodes = state.nodes.at[place].set(jnp.concatenate([times[:, None], steps], axis=1), mode="drop")
-    entered = jnp.concatenate([y0[1:], steps[:-1, 1]])
+    place = jnp.where(rows < kept, start + 1 + rows, capacity + 1)
+    recorded = jnp.concatenate([steps.end[:, None], steps.y], axis=1)
+    nodes = state.nodes.at[place].set(recorded, mode="drop")
+    entered = jnp.concatenate([y0[1:], steps.y[:-1, 1]])
     share, s, w = (nodes[start + kept, k] for k in range(3))
     state = state._replace(
         share=share,
@@ -217,42 +210,29 @@ def _recorded(state: _State, solution, overshot, room):
         pieces=state.pieces.at[place - 1].set(state.piece, mode="drop"),
         count=start + kept,
     )
-    return state, complete, jnp.where(overshot, saved_times[jnp.maximum(taken - 1, 0)], 1.0)
+    return state, complete, jnp.where(overshot, steps.end[jnp.maximum(steps.count - 1, 0)], 1.0)
 
 
-def _integrate(table, seen, duration, how, state, final, goal, floor):
+def _integrate(table, seen, duration, how, state, final, goal, floor) -> Steps:
     """Steps from the state to `final` or to the first that passes `goal` or falls below the speed `floor`."""
 
-    def solve(inputs, controller, adjoint):
-        table, seen, duration, share, y0, final, goal = inputs
+    def solve(method, inputs, *more):
+        table, seen, duration, share, y0 = inputs
 
-        def field(u, y, _):
-            row = interval(seen, u)
+        def field(row, u, y):
             return jnp.stack([y[1], acceleration(table, seen, duration, state.piece, row, u, y[0], y[1])])
 
-        return dfx.diffeqsolve(
-            dfx.ODETerm(field),
-            how.solver,
-            share,
-            final,
-            None,
-            y0,
-            saveat=dfx.SaveAt(steps=True),
-            stepsize_controller=controller,
-            event=dfx.Event(lambda t, y, args, **_: (y[0] > goal) | (y[1] < floor)),
-            adjoint=ADJOINTS[adjoint],
-            max_steps=how.max_steps,
-            throw=False,
-        )
+        return method(field, seen, how, share, final, y0, *more)
 
-    inputs = (table, seen, duration, state.share, jnp.stack([state.s, state.w]), final, goal)
-    way, knots = stop_gradient(goal - state.s), seen.share
-    if how.adjoint == "none":
-        return solve(inputs, adaptive(how, way, knots), how.adjoint)
-    ends = solve(stop_gradient(inputs), adaptive(how, way, stop_gradient(knots)), "none").ts
-    assert ends is not None
-    fixed = stop_gradient((state.share, final))
-    return solve(inputs, repeated(how, ends, knots, *fixed), how.adjoint)
+    goal, final = stop_gradient((goal, final))
+
+    def past(y):
+        return (y[0] > goal) | (y[1] < floor)
+
+    inputs = (table, seen, duration, state.share, jnp.stack([state.s, state.w]))
+    fixed = inputs if how.adjoint == "none" else stop_gradient(inputs)
+    steps = solve(found, fixed, past, goal - stop_gradient(state.s))
+    return steps if how.adjoint == "none" else solve(repeated, inputs, steps)
 
 
 def _append(state, wanted, share, s, w, entry_w, *, held):

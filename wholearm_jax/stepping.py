@@ -1,30 +1,36 @@
-"""Steps: how a motion is integrated, and the controllers that choose its steps."""
+"""Steps: how a motion is integrated, by one of diffrax's solvers, and the steps that its error chooses.
+
+The loop is the package's own, about diffrax's solver and its controller of errors: every step lies in one interval of
+the torque schedule, which is looked up once a step and not at each stage; where the next knot lies costs nothing; and
+nothing else is watched, saved or compiled. (`diffrax.diffeqsolve` compiles to a third more operations for this work;
+`benchmarks/skipping.py` has the times of both.)
+"""
 
 from collections.abc import Callable
-from dataclasses import replace
+from typing import NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
+import equinox.internal as eqxi
+import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
-ADJOINTS = {
-    "none": dfx.DirectAdjoint(),
-    "both": dfx.DirectAdjoint(),  # forward and reverse mode
-    "forward": dfx.ForwardMode(),
-    "reverse": dfx.RecursiveCheckpointAdjoint(),
-}
+from wholearm_jax.schedule import Window, interval
+
+LOOPS = {"none": "lax", "forward": "lax", "reverse": "checkpointed", "both": "bounded"}
+"""Which of equinox's loops serves each adjoint: `bounded` ones pass both modes, `lax` and `checkpointed` one of them."""
 
 
 class Integration(eqx.Module):
     """How to integrate: diffrax solver, error `tolerance` a step (relative, of the wire's scale), limits, adjoint.
 
     `steps` says that the torque schedule has steps inside the phase. `adjoint` says what the solve will be
-    differentiated by: `"none"`, `"forward"`, `"reverse"` or `"both"`. For all but the first the steps are found
-    once by the adaptive controller and taken again as they are. Differentiating saved steps through rejected ones in
-    reverse mode gives wrong derivatives (seen with diffrax 0.7.2), and forward mode through the controller erratic ones
-    (off by up to 3 % at any tolerance). All but a `tolerance`
+    differentiated by: `"none"`, `"forward"`, `"reverse"` (which keeps one state a step and computes each step again on
+    its way back) or `"both"` (which keeps every stage). For all but the first the steps are found once by their errors
+    and taken again as they are: through rejected steps reverse mode gives wrong derivatives (seen with diffrax 0.7.2),
+    and through the choice of steps forward mode erratic ones (off by up to 3 % at any tolerance). All but a `tolerance`
     that is an array is static: each choice is a program of its own. The package's own programs get theirs as data.
     """
 
@@ -38,86 +44,129 @@ class Integration(eqx.Module):
 
 def tolerance_as_data(how: Integration, dtype) -> Integration:
     """The same integration, with a tolerance that is an array: all tolerances share a program."""
-    return replace(how, tolerance=jnp.asarray(how.tolerance, dtype))
+    return eqx.tree_at(lambda h: h.tolerance, how, jnp.asarray(how.tolerance, dtype))
 
 
-def adaptive(how: Integration, way, knots) -> dfx.AbstractStepSizeController:
-    """Steps by their error that end on the torque's knots; `way` is what is left of the piece."""
+class Steps(NamedTuple):
+    """Accepted steps, `count` of them: when each ends, in which interval of the schedule it lies, the state at its end.
+
+    `passed` says that the last one came past what was to stop it, `complete` that steps did not run out before.
+    """
+
+    end: Float[Array, "steps"]
+    row: Int[Array, "steps"]
+    y: Float[Array, "steps 2"]
+    count: Int[Array, ""]
+    passed: Bool[Array, ""]
+    complete: Bool[Array, ""]
+
+
+class _Step(NamedTuple):
+    """The next step that `found` tries; `size` is how long it would be if no knot cut it."""
+
+    begin: Float[Array, ""]
+    end: Float[Array, ""]
+    size: Float[Array, ""]
+    row: Int[Array, ""]
+    y: Float[Array, "2"]
+    jumped: Bool[Array, ""] | bool
+    reused: tuple
+    control: tuple
+    tries: Int[Array, ""]
+    steps: Steps
+
+
+def found(
+    field: Callable, seen: Window, how: Integration, begin, final, y, past: Callable, way: Float[Array, ""]
+) -> Steps:
+    """Steps by their error from `begin` to `final`, or to the first that comes `past(y)`; each ends at a knot at most.
+
+    `field(row, share, y)` is `dy/du` in an interval of the schedule. The first step is a 32nd of the phase, or half of
+    `way` at the speed there, if that is shorter.
+    """
     errors = dfx.PIDController(rtol=how.tolerance, atol=how.tolerance)
-    errors = _FirstStep(controller=errors, way=way, rtol=how.tolerance, atol=how.tolerance, norm=errors.norm)
-    return dfx.ClipStepSizeController(errors, step_ts=knots, jump_ts=knots if how.steps else None)
+    solver, term = _with_stages(how.solver, "lax"), dfx.ODETerm(lambda u, y, row: field(row, u, y))
+    order = solver.error_order(term)
+    eps = jnp.finfo(y.dtype).eps
+
+    def cut(begin, size, row):
+        """Where a step ends: on the interval's end, rather than next to it or beyond."""
+        stop = jnp.minimum(jnp.where(row < seen.last, seen.share[row + 1], final), final)
+        return jnp.where(begin + size > stop - 100 * eps, stop, begin + size)
+
+    def attempt(at: _Step) -> _Step:
+        y, error, _, reused, _ = solver.step(term, at.begin, at.end, at.y, at.row, at.reused, at.jumped)
+        error = jnp.where(jnp.isnan(error), jnp.inf, error)
+        kept, begin, end, _, control, _ = errors.adapt_step_size(
+            at.begin, at.end, at.y, y, None, error, order, at.control
+        )
+        # What a knot cut short says nothing against the length that was meant.
+        size = jnp.where(kept, jnp.maximum(end - begin, at.size), end - begin)
+        row = interval(seen, begin)
+        place = jnp.where(kept, at.steps.count, how.max_steps)
+        steps = at.steps._replace(
+            end=at.steps.end.at[place].set(at.end, mode="drop"),
+            row=at.steps.row.at[place].set(at.row, mode="drop"),
+            y=at.steps.y.at[place].set(y, mode="drop"),
+            count=at.steps.count + kept,
+            passed=kept & past(y),
+        )
+        y, reused = jax.tree.map(lambda new, old: jnp.where(kept, new, old), (y, reused), (at.y, at.reused))
+        jumped = jnp.where(kept, row != at.row, at.jumped) if how.steps else False
+        return _Step(begin, cut(begin, size, row), size, row, y, jumped, reused, control, at.tries + 1, steps)
+
+    def going(at: _Step):
+        return (at.begin < final) & ~at.steps.passed & (at.tries < how.max_steps)
+
+    half = jnp.where(y[1] > 0, way / jnp.where(y[1] > 0, 2 * y[1], 1.0), 1.0)
+    size, row = jnp.clip(half, eps, 1 / 32), interval(seen, begin)
+    end = cut(begin, size, row)
+    none = Steps(
+        end=jnp.full(how.max_steps, begin),
+        row=jnp.zeros(how.max_steps, int),
+        y=jnp.broadcast_to(y, (how.max_steps, 2)),
+        count=jnp.asarray(0, int),
+        passed=jnp.asarray(False),
+        complete=jnp.asarray(False),
+    )
+    reused = solver.init(term, begin, end, y, row)
+    _, control = errors.init(term, begin, final, y, size, row, solver.func, order)
+    jumped = jnp.asarray(False) if how.steps else False
+    start = _Step(begin, end, size, row, y, jumped, reused, control, jnp.asarray(0, int), none)
+    last = jax.lax.while_loop(going, attempt, start)
+    return last.steps._replace(complete=(last.begin >= final) | last.steps.passed)
 
 
-def repeated(how: Integration, ends, knots, begin, final) -> dfx.AbstractStepSizeController:
-    """Steps that were found from `begin` to `final`, taken again; those that end on a knot move with it."""
-    ends = _continued(ends, begin, final)
-    # Where the torque may step a step ends before the knot (diffrax has told the time behind it), and the next begins
-    # behind it.
-    knot = knots[jnp.argmin(jnp.abs(ends[:, None] - stop_gradient(knots)), axis=1)]
-    fixed = stop_gradient(knot)
-    on_knot = jnp.abs(ends - fixed) < 1e-13
-    before, behind = (jnp.nextafter(fixed, way) if how.steps else ends for way in (-jnp.inf, jnp.inf))
-    begins = jnp.where(on_knot, behind + (knot - fixed), ends)
-    ends = jnp.where(on_knot, before + (knot - fixed), ends)
-    return _Repeat(ends, begins, how.steps)
+def repeated(field: Callable, seen: Window, how: Integration, begin, final, y, steps: Steps) -> Steps:
+    """Steps that were `found`, taken again; those that end on a knot move with it."""
+    count, row = steps.count, steps.row
+    knot = seen.share[row + 1]
+    ends = jnp.where((steps.end == stop_gradient(knot)) & (steps.end < final), knot, steps.end)
+    # A batch goes on until its last member has finished: the others take steps of no length.
+    ends = jnp.where(jnp.arange(how.max_steps) < count, ends, ends[jnp.maximum(count - 1, 0)])
+    ends = jnp.where(count > 0, ends, begin)
+    begins = jnp.concatenate([begin[None], ends[:-1]])
+    kind = LOOPS[how.adjoint]
+    solver, term = _with_stages(how.solver, kind), dfx.ODETerm(lambda u, y, row: field(row, u, y))
+    jumps = jnp.append(False, row[1:] != row[:-1])
+
+    def step(at):
+        k, y, reused, ys = at
+        jumped = jumps[k] if how.steps else False
+        y, _, _, reused, _ = solver.step(term, begins[k], ends[k], y, row[k], reused, jumped)
+        return k + 1, y, reused, ys.at[k].set(y)
+
+    start = jnp.asarray(0, int), y, solver.init(term, begin, ends[0], y, row[0]), jnp.broadcast_to(y, steps.y.shape)
+    *_, ys = eqxi.while_loop(
+        lambda at: at[0] < count, step, start, max_steps=how.max_steps, buffers=lambda at: at[3], kind=kind
+    )
+    return steps._replace(end=ends, y=ys)
 
 
-class _FirstStep(dfx.AbstractAdaptiveStepSizeController):
-    """A controller whose first step is a 32nd of the phase, or half of the way to the piece's end at its speed.
-
-    diffrax would check a first step passed to `diffeqsolve` by a host callback, and programs that call back to the
-    host are not kept in JAX's compilation cache.
-    """
-
-    controller: dfx.PIDController
-    way: Float[Array, ""]
-    rtol: float | Array
-    atol: float | Array
-    norm: Callable
-
-    def wrap(self, direction):
-        inner = self.controller.wrap(direction)
-        return _FirstStep(controller=inner, way=self.way, rtol=self.rtol, atol=self.atol, norm=self.norm)
-
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        speed = stop_gradient(y0[1])
-        half = jnp.where(speed > 0, self.way / jnp.where(speed > 0, 2 * speed, 1.0), 1.0)
-        first = jnp.clip(half, jnp.finfo(half.dtype).eps, 1 / 32)
-        return self.controller.init(terms, t0, t1, y0, first, args, func, error_order)
-
-    def adapt_step_size(self, *at):
-        return self.controller.adapt_step_size(*at)
+def solver_of(how: Integration) -> dfx.AbstractSolver:
+    """The solver, with a loop over its stages that may be differentiated as `how` says."""
+    return _with_stages(how.solver, "lax" if LOOPS[how.adjoint] == "lax" else "bounded")
 
 
-class _Repeat(dfx.AbstractStepSizeController):
-    """Takes given steps and rejects none: step `i` ends at `ends[i]`, the next begins at `begins[i]`.
-
-    With `jumps` the field may jump between steps: what the last stage of one found serves no longer for the next.
-    """
-
-    ends: Float[Array, "steps"]
-    begins: Float[Array, "steps"]
-    jumps: bool = eqx.field(static=True)
-
-    def wrap(self, direction):
-        return self
-
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        return self.ends[0], jnp.asarray(1, int)
-
-    def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, state):
-        following = self.ends[jnp.minimum(state, self.ends.shape[0] - 1)]
-        jumped = jnp.asarray(True) if self.jumps else False  # diffrax takes a constant `True` for its initial `False`
-        return True, self.begins[state - 1], following, jumped, state + 1, dfx.RESULTS.successful
-
-
-def _continued(ends, begin, final):
-    """Times of steps, with one as long as the last one after it and then `final` instead of infinite ones.
-
-    A batch goes on until its last member has finished: the others take steps that do not count, but that must be
-    harmless. One straight to the end of time would overflow, and what overflows has no derivative, not even zero.
-    """
-    taken = jnp.isfinite(ends).sum()
-    last, before = ends[taken - 1], jnp.where(taken > 1, ends[taken - 2], begin)
-    one_more = (jnp.arange(ends.shape[0]) == taken) & (taken > 0)
-    return jnp.where(jnp.isfinite(ends), ends, jnp.where(one_more, jnp.minimum(2 * last - before, final), final))
+def _with_stages(solver: dfx.AbstractSolver, kind: str) -> dfx.AbstractSolver:
+    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
