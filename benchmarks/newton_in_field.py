@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 
 from wholearm_jax.contacts import gaps
 from wholearm_jax.newton import newton
-from wholearm_jax.reduction import Table, along_wire, balance, horner, powers
+from wholearm_jax.reduction import Table, along_wire, balance, on_panel, powers
 from wholearm_jax.schedule import Window, interval, torque_in
 from wholearm_jax.system import System
 from wholearm_jax.wire import Wire
@@ -62,7 +62,7 @@ def direct(system: System, wire: Wire, table: Table) -> Direct:
     def place(s):
         piece = jnp.minimum((s >= wire.breaks[1:pieces]).sum(), pieces - 1)
         panel, xi = powers(table, piece, s)
-        z = horner(table.configuration[panel], xi) / system.configuration_unit
+        z = on_panel(table.configuration, panel, xi) / system.configuration_unit
         return z, along_wire(system, z, wire.chart[0])[0]
 
     z, x = jax.vmap(place)(s)

@@ -22,7 +22,7 @@ import wholearm_jax as wa
 from wholearm_jax.forces import force, score
 from wholearm_jax.motion import move
 from wholearm_jax.phase import end_configuration, prepare
-from wholearm_jax.reduction import horner, powers
+from wholearm_jax.reduction import on_panel, powers
 from wholearm_jax.sampling import SAMPLED, sample
 from wholearm_jax.scene import body
 from wholearm_jax.schedule import interval, torque_in
@@ -53,7 +53,7 @@ def bare(table, seen, duration, terms=(0, 1, 2, 3, 4), stop=False):
 
     def coefficients(piece, s):
         panel, xi = powers(table, piece, s)
-        values = horner(table.acceleration[panel], xi)
+        values = on_panel(table.acceleration, panel, xi)
         return [values[k] for k in terms]
 
     def field(u, y, _):

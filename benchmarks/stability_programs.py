@@ -17,7 +17,7 @@ from stability_scenes import Scenes
 from wholearm_jax.forces import arcs, force, on_arc, score
 from wholearm_jax.landing import acceleration
 from wholearm_jax.motion import move
-from wholearm_jax.reduction import Table, change, horner, powers, reduce_wire
+from wholearm_jax.reduction import Table, change, on_panel, powers, reduce_wire
 from wholearm_jax.scene import Formation, Hand, Heading, Polygon, body
 from wholearm_jax.schedule import Torque, torque_in, window
 from wholearm_jax.squeeze import holds
@@ -117,17 +117,20 @@ def follow(wire: Wire, table: Table, scene: Scenes, how: Integration) -> Followe
 
         def velocity(s):
             panel, xi = powers(table, piece, s)
-            return horner(table.velocity[panel], xi)
+            return on_panel(table.velocity, panel, xi)
 
         x, bend = jax.jvp(velocity, (s,), (jnp.ones_like(s),))
-        z = horner(table.configuration[panel], xi)
+        z = on_panel(table.configuration, panel, xi)
         return {"z": z, "x": x, "bend": bend, "slip": wire.slip_sign[piece], "joint": wire.joint_sign[piece]}
 
     def place(share):
         s = table.breaks[0] + table.length * share
         piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
         panel, xi = powers(table, piece, s)
-        tables = {"acceleration": horner(table.acceleration[panel], xi), "force": horner(table.force[panel], xi)}
+        tables = {
+            "acceleration": on_panel(table.acceleration, panel, xi),
+            "force": on_panel(table.force, panel, xi),
+        }
         tables |= {"chart": wire.chart[piece]}
         return read(piece, s) | tables
 

@@ -10,7 +10,7 @@ from wholearm_jax.phase import _run, prepare
 
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
-    *("status", "precision", "scene", "contacts", "system", "elimination", "newton", "writing", "programs"),
+    *("status", "precision", "lookup", "scene", "contacts", "system", "elimination", "newton", "writing", "programs"),
     *("march", "start", "places", "wire", "reduction"),
     *("schedule", "stepping", "landing", "motion", "forces", "verdict", "holding"),
     *("phase", "result", "sampling", "plan", "gradient", "gradient_check"),

@@ -10,7 +10,7 @@ import wholearm_jax as wa
 from wholearm_jax import plan
 from wholearm_jax.contacts import normal_rows, slip_rows
 from wholearm_jax.phase import start_configuration
-from wholearm_jax.reduction import change, horner, powers
+from wholearm_jax.reduction import change, on_panel, powers
 from wholearm_jax.scene import body
 from wholearm_jax.scene import heading as wa_heading
 from wholearm_jax.stepping import Integration
@@ -47,7 +47,7 @@ def test_momentum_balances_and_energy_falls_across_every_change(flown):
         unit = mechanics.configuration_unit
         z = start_configuration(table) / unit
         panel, xi = powers(table, jnp.asarray(0), table.breaks[0])
-        moving = horner(table.velocity[panel], xi) * entered.speed / unit
+        moving = on_panel(table.velocity, panel, xi) * entered.speed / unit
         sliding = jnp.sign(slip_rows(mechanics.contacts, z) @ moving)
         wrench = normal_rows(mechanics.contacts, z)
         wrench = wrench - (mechanics.contacts.friction * sliding)[:, None] * slip_rows(mechanics.contacts, z)

@@ -13,7 +13,7 @@ import pytest
 
 import wholearm_jax
 from wholearm_jax import squeeze
-from wholearm_jax.reduction import horner, powers
+from wholearm_jax.reduction import on_panel, powers
 
 W, H, X, MASS, GRAVITY = 0.03, 0.06, 0.08, 0.2, 9.81
 INERTIA = np.array([2e-3, 3e-3])
@@ -94,7 +94,7 @@ def slide(request):
     def configuration(s):
         piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
         panel, xi = powers(table, piece, s)
-        return horner(table.configuration[panel], xi)
+        return on_panel(table.configuration, panel, xi)
 
     return request.param, traced, s, np.asarray(jax.jit(jax.vmap(configuration))(s))
 

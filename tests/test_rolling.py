@@ -14,7 +14,7 @@ import wholearm_jax
 from wholearm_jax import scene_file, squeeze
 from wholearm_jax.contacts import constraint_curvature, constraint_rows, constraints, contacts, placed, slip_rows
 from wholearm_jax.phase import run
-from wholearm_jax.reduction import horner, powers
+from wholearm_jax.reduction import on_panel, powers
 from wholearm_jax.sampling import sample
 from wholearm_jax.scene import body, formation
 from wholearm_jax.schedule import Torque
@@ -197,8 +197,8 @@ def test_pivot_by_hand():
     torque, v = np.array([0.11, -0.34]), 0.7
     for where, f_rows in zip(s, force, strict=True):
         panel, xi = powers(table, jnp.asarray(0), jnp.asarray(where))
-        z = np.asarray(horner(table.configuration[panel], xi))
-        x = np.asarray(horner(table.velocity[panel], xi))
+        z = np.asarray(on_panel(table.configuration, panel, xi))
+        x = np.asarray(on_panel(table.velocity, panel, xi))
         spin = x[2] * v
         rates, bends, arms, pushes = [], [], [], []
         turn = np.array([[np.cos(z[2]), -np.sin(z[2])], [np.sin(z[2]), np.cos(z[2])]])

@@ -18,7 +18,7 @@ from wholearm_jax.march import Watched, crossings
 from wholearm_jax.motion import move
 from wholearm_jax.phase import end_configuration, ending, prepare
 from wholearm_jax.plan import outcomes
-from wholearm_jax.reduction import balance, blank, horner, powers
+from wholearm_jax.reduction import balance, blank, on_panel, powers
 from wholearm_jax.scene import body
 from wholearm_jax.schedule import window
 from wholearm_jax.squeeze import hold, holds
@@ -76,7 +76,7 @@ def test_a_wire_may_turn_far():
     def read(piece, s):
         panel, xi = powers(table, jnp.asarray(piece), s)
         unit = formation.configuration_unit
-        return horner(table.configuration[panel], xi) / unit, horner(table.velocity[panel], xi) / unit
+        return on_panel(table.configuration, panel, xi) / unit, on_panel(table.velocity, panel, xi) / unit
 
     for k in met:
         before, after = read(k - 1, table.breaks[k]), read(k, table.breaks[k])
@@ -152,14 +152,14 @@ def test_wedging_on_the_way_back_does_not_spoil_the_table():
     for s in np.linspace(0.02, 0.98, 60) * float(table.length):
         piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
         panel, xi = powers(table, piece, jnp.asarray(s))
-        z = horner(table.configuration[panel], xi) / formation.configuration_unit
-        x = horner(table.velocity[panel], xi) / formation.configuration_unit
+        z = on_panel(table.configuration, panel, xi) / formation.configuration_unit
+        x = on_panel(table.velocity, panel, xi) / formation.configuration_unit
         signs = wire.slip_sign[piece], wire.joint_sign[piece]
         back, right = balance(formation, z, x, 0 * x, -signs[0], -signs[1])
         smooth, _ = balance(formation, z, x, 0 * x, 0 * signs[0], signs[1])
         turned.append(float(jnp.linalg.det(back) * jnp.linalg.det(smooth)))
         exact = jnp.linalg.solve(back, right)[0, jnp.array([0, 3, 4])]
-        np.testing.assert_array_equal(np.sign(horner(table.backward[panel], xi)), np.sign(exact))
+        np.testing.assert_array_equal(np.sign(on_panel(table.backward, panel, xi)), np.sign(exact))
     assert min(turned) < 0 < max(turned), "nothing wedges: it is no test"
 
 

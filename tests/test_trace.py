@@ -12,7 +12,7 @@ import wholearm_jax as wa
 from wholearm_jax.contacts import gaps, normal_rows, slip_rows
 from wholearm_jax.newton import newton
 from wholearm_jax.phase import end_configuration, ending
-from wholearm_jax.reduction import horner, powers
+from wholearm_jax.reduction import on_panel, powers
 from wholearm_jax.scene import body
 from wholearm_jax.scene_file import to_dict
 from wholearm_jax.system import system
@@ -68,8 +68,8 @@ def test_the_table_holds_the_wire_between_its_nodes(traced):
         for s in np.random.default_rng(1).uniform(0, float(table.length), 50):
             piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
             panel, xi = powers(table, piece, jnp.asarray(s))
-            z = horner(table.configuration[panel], xi) / formation.configuration_unit
-            x = horner(table.velocity[panel], xi) / formation.configuration_unit
+            z = on_panel(table.configuration, panel, xi) / formation.configuration_unit
+            x = on_panel(table.velocity, panel, xi) / formation.configuration_unit
             assert float(jnp.abs(gaps(formation.contacts, z)).max()) < 1e-10
             assert float(jnp.abs(normal_rows(formation.contacts, z) @ x).max()) < 1e-9
 
@@ -80,8 +80,8 @@ def test_slips_vanish_where_pieces_meet(traced):
         table, wire = at.table, at.wire
         for k in range(1, int(table.count)):
             panel, xi = powers(table, jnp.asarray(k), table.breaks[k])
-            z = horner(table.configuration[panel], xi) / formation.configuration_unit
-            x = horner(table.velocity[panel], xi) / formation.configuration_unit
+            z = on_panel(table.configuration, panel, xi) / formation.configuration_unit
+            x = on_panel(table.velocity, panel, xi) / formation.configuration_unit
             flipped = np.flatnonzero(np.asarray(wire.slip_sign[k] != wire.slip_sign[k - 1]))
             assert flipped.size > 0
             slip = np.asarray(slip_rows(formation.contacts, z) @ x)
@@ -102,8 +102,8 @@ def test_a_wire_that_ends_at_a_kink_keeps_its_friction(beyond):
     data = to_dict(wa.load("heptagon"))
     whole = wa.trace(wa.load("heptagon"))[1]
     panel, xi = powers(whole.table, jnp.asarray(0), whole.table.breaks[1])
-    kink = horner(whole.table.configuration[panel], xi)
-    speed = horner(whole.table.velocity[panel], xi)
+    kink = on_panel(whole.table.configuration, panel, xi)
+    speed = on_panel(whole.table.velocity, panel, xi)
     data["start"] = dict(zip(data["start"], end_configuration(wa.trace(wa.load("heptagon"))[0]).tolist(), strict=True))
     data["phase"] = [data["phase"][1] | {"until": {"phi": float(kink[2] + beyond * jnp.sign(speed[2]))}}]
     at = wa.trace(wa.parse(data))[0]
@@ -123,7 +123,7 @@ def test_until_ends_a_phase_early():
 def test_the_other_way_along_the_wire():
     ahead, back = wa.trace(changed("heptagon"))[0], wa.trace(changed("heptagon", toward="x+"))[0]
     panel, xi = powers(ahead.table, jnp.asarray(0), ahead.table.breaks[0])
-    start = float(horner(ahead.table.configuration[panel], xi)[0])
+    start = float(on_panel(ahead.table.configuration, panel, xi)[0])
     assert float(end_configuration(ahead)[0]) < start - 0.01
     assert float(end_configuration(back)[0]) > start + 0.001
 
@@ -164,5 +164,5 @@ def test_a_wire_passes_the_turning_point_of_theta1():
     assert int(table.status) == wa.Status.OK
     np.testing.assert_array_equal(wire.joint_sign[:2, 0], [-1.0, 1.0])
     panel, xi = powers(table, jnp.asarray(1), table.breaks[1])
-    assert abs(float(horner(table.velocity[panel], xi)[3])) < 1e-10
+    assert abs(float(on_panel(table.velocity, panel, xi)[3])) < 1e-10
     assert float(table.breaks[1]) < float(table.length) - 1e-3

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.landing import acceleration, single_step
 from wholearm_jax.motion import Motion
-from wholearm_jax.reduction import Table, horner, powers
+from wholearm_jax.reduction import Table, on_panel, polynomial, powers
 from wholearm_jax.schedule import Window, torque_in
 from wholearm_jax.stepping import Integration
 
@@ -94,8 +94,8 @@ def arc(table: Table, seen: Window, duration, share, s, w, piece, row, moving) -
 def on_arc(one: Arcs, xi: Float[Array, ""]):
     """Share, `s` and `w` at `xi` of one arc (no leading axis)."""
     width = one.share[1] - one.share[0]
-    s = horner(one.quintic, xi)
-    slope = horner(one.quintic[1:] * jnp.arange(1.0, 6.0), xi)
+    s = polynomial(one.quintic, xi)
+    slope = polynomial(one.quintic[1:] * jnp.arange(1.0, 6.0), xi)
     moving = one.live & ~one.held & (width > 0)
     return one.share[0] + xi * width, s, jnp.where(moving, slope / jnp.where(moving, width, 1.0), 0.0)
 
@@ -103,7 +103,7 @@ def on_arc(one: Arcs, xi: Float[Array, ""]):
 def force(table: Table, seen: Window, duration, piece, row, share, s, w) -> Float[Array, "slots"]:
     """Constraint forces [N] for forward travel: `c_n`, and `c_t` in tangential rows."""
     panel, xi = powers(table, piece, s)
-    terms = horner(table.force[panel], xi)
+    terms = on_panel(table.force, panel, xi)
     v = w / duration
     one = jnp.ones_like(v)
     return terms @ jnp.concatenate([jnp.stack([one, v**2, v]), torque_in(seen, row, share)])

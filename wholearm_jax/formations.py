@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.contacts import every_contact, frames, normal_rows
 from wholearm_jax.phase import Traced, end_configuration, ending, prepare
-from wholearm_jax.reduction import Table, change, horner, powers
+from wholearm_jax.reduction import Table, change, on_panel, powers
 from wholearm_jax.scene import COORDINATES, Phase, Scene, body, contact_name, formation, heading
 from wholearm_jax.squeeze import Bound, bound, hold
 from wholearm_jax.status import Status
@@ -62,7 +62,7 @@ class Way:
 def leaving(table: Table) -> Float[Array, "5"]:
     """`z_dot` (SI) at a wire's end for `ds/dt = 1`."""
     panel, xi = powers(table, table.count - 1, table.breaks[-1])
-    return horner(table.velocity[panel], xi)
+    return on_panel(table.velocity, panel, xi)
 
 
 def touching(scene: Scene, z: Float[Array, "5"]) -> tuple[str, ...]:

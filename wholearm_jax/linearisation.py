@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.forces import spare
-from wholearm_jax.reduction import Table, change, horner, powers
+from wholearm_jax.reduction import Table, change, on_panel, powers
 from wholearm_jax.shooting import PARTS, ROWS, SAMPLES, STEPS, Variables, local, shoot
 from wholearm_jax.stepping import Integration
 
@@ -125,7 +125,7 @@ def passed_on(before: Table, after: Table) -> Float[Array, "seams"]:
 
     def one(before, after):
         panel, xi = powers(before, before.count - 1, before.breaks[-1])
-        return change(after, horner(before.velocity[panel], xi)).speed
+        return change(after, on_panel(before.velocity, panel, xi)).speed
 
     return jax.vmap(one)(before, after)
 

@@ -25,7 +25,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.landing import acceleration, land
-from wholearm_jax.reduction import Table, horner, powers
+from wholearm_jax.reduction import Table, on_panel, powers
 from wholearm_jax.schedule import Window, interval, torque_in
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration, Steps, found, repeated
@@ -254,8 +254,8 @@ def _departure(table, seen, state):
     The accelerations at rest are linear in the torque, hence piecewise linear in time: their first signs are exact.
     """
     panel, xi = powers(table, state.piece, state.s)
-    ahead = horner(table.acceleration[panel], xi)[jnp.array([0, 3, 4])]
-    behind = -horner(table.backward[panel], xi)
+    ahead = on_panel(table.acceleration, panel, xi)[jnp.array([0, 3, 4])]
+    behind = -on_panel(table.backward, panel, xi)
     rows = jnp.arange(seen.slope.shape[0])
     low = jnp.maximum(seen.share[:-1], state.share)
     high = jnp.minimum(seen.share[1:], 1.0)

@@ -15,7 +15,7 @@ from wholearm_jax.forces import Score, score
 from wholearm_jax.holding import Departure, Statics, statics
 from wholearm_jax.motion import Motion, move
 from wholearm_jax.programs import Program
-from wholearm_jax.reduction import Change, Table, change, horner, powers, reduce_wire
+from wholearm_jax.reduction import Change, Table, change, on_panel, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, contact_name
 from wholearm_jax.schedule import Torque, window
 from wholearm_jax.stepping import Integration, tolerance_as_data
@@ -79,7 +79,7 @@ def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integra
     verdict = judge(table, motion, scored, goal, entered, arrival)
     last = jnp.maximum(motion.count - 1, 0)
     panel, xi = powers(table, motion.piece[last], motion.s[motion.count])
-    leaving = horner(table.velocity[panel], xi) * motion.w[motion.count] / duration
+    leaving = on_panel(table.velocity, panel, xi) * motion.w[motion.count] / duration
     return Outcome(start, duration, entered, motion, scored, verdict, leaving)
 
 
@@ -87,7 +87,7 @@ def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integra
 def configuration(table: Table, piece: Int[Array, ""], s: Float[Array, ""]) -> Float[Array, "5"]:
     """`z` (SI) at a place of a wire."""
     panel, xi = powers(table, piece, s)
-    return horner(table.configuration[panel], xi)
+    return on_panel(table.configuration, panel, xi)
 
 
 @jax.jit
@@ -116,7 +116,7 @@ def balance_at_start(scene: Scene, phase: Phase, traced: Traced) -> tuple[Static
     """The statics where a phase begins, and the accelerations with which the object would leave."""
     table = traced.table
     panel, xi = powers(table, jnp.asarray(0, int), table.breaks[0])
-    ahead, behind = jax.device_get((horner(table.acceleration[panel], xi), horner(table.backward[panel], xi)))
+    ahead, behind = jax.device_get((on_panel(table.acceleration, panel, xi), on_panel(table.backward, panel, xi)))
     balance = statics(scene, phase.formation, start_configuration(table))
     return balance, Departure(ahead[[0, 3, 4]], behind)
 

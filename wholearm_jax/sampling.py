@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from wholearm_jax.forces import arcs, force, on_arc
 from wholearm_jax.motion import Motion
 from wholearm_jax.programs import Program
-from wholearm_jax.reduction import Table, horner, powers
+from wholearm_jax.reduction import Table, on_panel, powers
 from wholearm_jax.result import Result
 from wholearm_jax.schedule import Torque, padded, rounded, window
 from wholearm_jax.status import Status
@@ -59,8 +59,8 @@ def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shar
         forces = force(table, seen, duration, arc.piece, arc.row, share, s, w)
         cn, ct = by_contact(table, arc.piece, jnp.where(arc.held | over, jnp.nan, forces))
         tau = seen.values[arc.row] + seen.slope[arc.row] * (share - seen.share[arc.row])
-        z_dot = horner(table.velocity[panel], at) * w / duration
-        return s, horner(table.configuration[panel], at), z_dot, tau, cn, ct
+        z_dot = on_panel(table.velocity, panel, at) * w / duration
+        return s, on_panel(table.configuration, panel, at), z_dot, tau, cn, ct
 
     return Trajectory(start + duration * shares, *jax.vmap(one)(shares))
 

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from wholearm_jax.lookup import row
+
 ROWS = 128  # schedules are padded to a multiple of this: those of like length share compiled programs
 
 
@@ -102,6 +104,6 @@ def interval(seen: Window, share: Float[Array, ""]) -> Int[Array, ""]:
     return jnp.clip((share >= seen.share).sum() - 1, seen.first, seen.last)
 
 
-def torque_in(seen: Window, row: Int[Array, ""], share: Float[Array, ""]) -> Float[Array, "2"]:
-    """The torque [N m] of interval `row` at a share of the phase."""
-    return seen.values[row] + seen.slope[row] * (share - seen.share[row])
+def torque_in(seen: Window, number: Int[Array, ""], share: Float[Array, ""]) -> Float[Array, "2"]:
+    """The torque [N m] of one interval at a share of the phase."""
+    return row(seen.values, number) + row(seen.slope, number) * (share - row(seen.share, number))

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from wholearm_jax.forces import linear_slacks
-from wholearm_jax.reduction import Table, horner, powers
+from wholearm_jax.reduction import Table, on_panel, powers
 
 SPEEDS = 12  # speed intervals of the bound
 FASTEST = 8.0  # it covers speeds up to this many wire lengths a duration
@@ -45,7 +45,7 @@ def coefficients(table: Table, s: Float[Array, ""]):
     inner = table.breaks[1:-1]
     piece = jnp.minimum((s >= inner).sum(), table.count - 1)
     panel, xi = powers(table, piece, s)
-    return horner(table.acceleration[panel], xi), horner(table.force[panel], xi)
+    return on_panel(table.acceleration, panel, xi), on_panel(table.force, panel, xi)
 
 
 def hold(table: Table, s, v=0.0, a=0.0) -> Hold:

@@ -7,7 +7,7 @@ nothing else is watched, saved or compiled. (`diffrax.diffeqsolve` compiles to a
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -19,8 +19,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.schedule import Window, interval
 
-LOOPS = {"none": "lax", "forward": "lax", "reverse": "checkpointed", "both": "bounded"}
-"""Which of equinox's loops serves each adjoint: `bounded` ones pass both modes, `lax` and `checkpointed` one of them."""
+Loop = Literal["lax", "checkpointed", "bounded"]
+LOOPS: dict[str, Loop] = {"none": "lax", "forward": "lax", "reverse": "checkpointed", "both": "bounded"}
+"""Equinox's loop that serves each adjoint: a `bounded` one passes both modes, the others one of them."""
 
 
 class Integration(eqx.Module):
@@ -87,6 +88,7 @@ def found(
     errors = dfx.PIDController(rtol=how.tolerance, atol=how.tolerance)
     solver, term = _with_stages(how.solver, "lax"), dfx.ODETerm(lambda u, y, row: field(row, u, y))
     order = solver.error_order(term)
+    assert order is not None  # that of a stochastic solver may be
     eps = jnp.finfo(y.dtype).eps
 
     def cut(begin, size, row):
@@ -95,11 +97,11 @@ def found(
         return jnp.where(begin + size > stop - 100 * eps, stop, begin + size)
 
     def attempt(at: _Step) -> _Step:
-        y, error, _, reused, _ = solver.step(term, at.begin, at.end, at.y, at.row, at.reused, at.jumped)
+        y, miss, _, reused, _ = solver.step(term, at.begin, at.end, at.y, at.row, at.reused, at.jumped)
+        error = jnp.asarray(miss)
         error = jnp.where(jnp.isnan(error), jnp.inf, error)
-        kept, begin, end, _, control, _ = errors.adapt_step_size(
-            at.begin, at.end, at.y, y, None, error, order, at.control
-        )
+        kept, *span, _, control, _ = errors.adapt_step_size(at.begin, at.end, at.y, y, None, error, order, at.control)
+        begin, end = (jnp.asarray(share) for share in span)
         # What a knot cut short says nothing against the length that was meant.
         size = jnp.where(kept, jnp.maximum(end - begin, at.size), end - begin)
         row = interval(seen, begin)
@@ -168,5 +170,5 @@ def solver_of(how: Integration) -> dfx.AbstractSolver:
     return _with_stages(how.solver, "lax" if LOOPS[how.adjoint] == "lax" else "bounded")
 
 
-def _with_stages(solver: dfx.AbstractSolver, kind: str) -> dfx.AbstractSolver:
+def _with_stages(solver: dfx.AbstractSolver, kind: Loop) -> dfx.AbstractSolver:
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
