@@ -4,11 +4,11 @@
 
 Plans of two phases (`random_plans`) get optimised and quasi-static torques in turn. Half way they hold the object for
 `PAUSE`, or, to see what that is worth, stop and go on at once. Plans of three phases that do not stop (`flying_plans`)
-get optimised torques. These are then spoiled. A *squeeze* adds torques along the one
-direction that leaves the motion as it is, as many as move the predicted least force to a place drawn evenly on both
-sides of zero. A *push* adds torques along the other direction, so that the object falls short. Variants are drawn until
-a plan has two that are predicted to hold and two to fail, or the draws are used up. One that is predicted to reach a
-wire's end early, and at speed, is left out: its plan says nothing about the impact that follows.
+get optimised torques. These are then spoiled. A *squeeze* adds torques along the one direction that leaves the motion
+as it is, as many as move the predicted least force to a place drawn evenly on both sides of zero. A *push* adds torques
+along the other direction, so that the object falls short. Variants are drawn until a plan has two that are predicted to
+hold and two to fail, or the draws are used up. One that is predicted to reach a wire's end early, and at speed, is left
+out: its plan says nothing about the impact that follows.
 
 What counts, by the same tolerances on both sides:
 

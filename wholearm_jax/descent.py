@@ -293,9 +293,9 @@ def begin(p: Variables, optimiser) -> Descent:
     """A descent before its first step."""
     zero, still = jnp.zeros(()), jax.tree.map(jnp.zeros_like, p)
     state = optimiser.init(ravel_pytree(p)[0])
-    never = zero + jnp.inf
-    least = 0 * p.log_duration
-    return Descent(p, state, p, still, zero + 1, least, zero, zero + 1, never, zero, never, state.temperature)
+    worst = zero + jnp.inf  # no step is worse
+    unknown = 0 * p.log_duration
+    return Descent(p, state, p, still, zero + 1, unknown, zero, zero + 1, worst, zero, worst, state.temperature)
 
 
 @Program

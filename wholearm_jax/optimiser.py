@@ -37,6 +37,10 @@ from wholearm_jax.wire import Resolution
 
 TORQUE_SHARE = 0.9  # share of the torque limits that a start may use
 GOOD = 0.99  # share of the bound with which no further start is tried
+RISE = 0.01  # most that a step which is held back may raise the merit, as a share of the bound
+DAMPING, DAMPED = 1e-8, 1.3  # price of its size, and by how much that grows from one such step to the next
+CLOSE = 1e-5  # sum of the defects from which full steps close them
+LOST = 1e-6  # share of a step at which a descent gives up
 
 
 @dataclass(frozen=True)
@@ -342,10 +346,6 @@ def _method(optimiser, phases: int):
 _ONE = np.ones(())
 _HOW = Integration()
 _FULL = {"reach": _ONE, "rise": np.full((), np.inf), "damping": np.zeros(())}
-RISE = 0.01  # most that a step which is held back may raise the merit, as a share of the bound
-DAMPING, DAMPED = 1e-8, 1.3  # price of its size, and by how much that grows from one such step to the next
-CLOSE = 1e-5  # sum of the defects from which full steps close them
-LOST = 1e-6  # share of a step at which a descent gives up
 
 
 def _evenly(duration, values) -> Torque:
