@@ -20,12 +20,14 @@ from work_precision import problems
 
 import wholearm_jax as wa
 from wholearm_jax.forces import force, score
+from wholearm_jax.landing import acceleration
 from wholearm_jax.motion import move
 from wholearm_jax.phase import end_configuration, prepare
 from wholearm_jax.reduction import on_panel, powers
 from wholearm_jax.sampling import SAMPLED, sample
 from wholearm_jax.scene import body
 from wholearm_jax.schedule import interval, torque_in
+from wholearm_jax.stepping import found
 from wholearm_jax.wire import Resolution
 
 jax.config.update("jax_enable_x64", True)
@@ -88,6 +90,17 @@ def bare(table, seen, duration, terms=(0, 1, 2, 3, 4), stop=False):
     ).ys
 
 
+@jax.jit
+def stepped(table, seen, duration):
+    """The same stage with all terms, by the package's own loop."""
+
+    def field(row, u, y):
+        return jnp.stack([y[1], acceleration(table, seen, duration, 0, row, u, y[0], y[1])])
+
+    y, final = jnp.stack([table.breaks[0], jnp.zeros(())]), jnp.ones(())
+    return found(field, seen, wa.Integration(), 0 * final, final, y, lambda y: y[0] > table.breaks[1], final).y
+
+
 def rows(problem, repeats: int) -> list[dict]:
     """Every comparison on one phase: times of both sides [s] and their ratio."""
     table, seen, duration = problem.traced.table, problem.seen, problem.duration
@@ -114,6 +127,10 @@ def rows(problem, repeats: int) -> list[dict]:
         ),
         "the gradient, when the margin is asked": (lambda: gradient(seen.values), "margin"),
         "repeatable steps, when no reverse mode is asked": (lambda: moved(table, seen, duration, "both"), "move"),
+        "what diffeqsolve provides, when steps are asked": (
+            lambda: bare(table, seen, duration),
+            lambda: stepped(table, seen, duration),
+        ),
         "the viscous term, when nothing is viscous": (
             lambda: bare(table, seen, duration),
             lambda: bare(table, seen, duration, terms=(0, 1, 3, 4)),
@@ -128,12 +145,12 @@ def rows(problem, repeats: int) -> list[dict]:
         ),
     }
     base = {"margin": lambda: scored(table, seen, duration), "move": lambda: moved(table, seen, duration)}
-    found = []
+    compared = []
     for name, (with_it, without) in calls.items():
         without = base[without] if isinstance(without, str) else without
         times = measure.compare({"with": with_it, "without": without}, repeats=repeats)
-        found.append({"what": name, **times, "ratio": times["with"] / times["without"]})
-    return found
+        compared.append({"what": name, **times, "ratio": times["with"] / times["without"]})
+    return compared
 
 
 def _margin(table, seen, duration, values):
@@ -148,14 +165,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer repeats")
     repeats = 3 if parser.parse_args().quick else 9
-    found = {}
+    tables = {}
     for problem in problems(referred=False)[::2]:
-        found[problem.name] = rows(problem, repeats)
+        tables[problem.name] = rows(problem, repeats)
         print(f"\n{problem.name}: time with over time without")
-        for row in found[problem.name]:
+        for row in tables[problem.name]:
             times = f"{1e3 * row['with']:.3f} against {1e3 * row['without']:.3f} ms"
             print(f"  {row['what']:50s}{row['ratio']:8.2f}   ({times})")
-    measure.save("skipping", found)
+    measure.save("skipping", tables)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.landing import acceleration, single_step
+from wholearm_jax.lookup import pick
 from wholearm_jax.motion import Motion
 from wholearm_jax.reduction import Table, on_panel, polynomial, powers
 from wholearm_jax.schedule import Window, torque_in
@@ -164,11 +165,11 @@ def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion
 
     def refine(flat):
         step, contact = flat // values.shape[2], flat % values.shape[2]
-        arc = jax.tree.map(lambda a: a[step], steps)
-        seat, reach = jnp.argmin(values[step, :, contact]) / (SAMPLES - 1), 1.0 / (SAMPLES - 1)
-        inputs = table, seen, duration, arc, motion.entry_w[step]
+        arc = jax.tree.map(lambda a: pick(a, step), steps)
+        seat, reach = jnp.argmin(pick(pick(values, step).T, contact)) / (SAMPLES - 1), 1.0 / (SAMPLES - 1)
+        inputs = table, seen, duration, arc, pick(motion.entry_w, step)
         fixed = stop_gradient(inputs)
-        xi = _minimise(lambda xi: slacks_on(*fixed[:4], xi)[contact], seat, reach)
+        xi = _minimise(lambda xi: pick(slacks_on(*fixed[:4], xi), contact), seat, reach)
         _, curve, shift, *_ = _dip(*fixed, how, contact, xi)
         low, high = jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0)
         xi = stop_gradient(jnp.clip(xi + shift, low, high))
@@ -228,12 +229,12 @@ def _dip(table, seen, duration, arc, entry_w, how, contact, xi):
     s, w = single_step(table, seen, duration, how, arc.piece, arc.row, arc.share[0], begin, xi * width)
 
     def at(share, s, w):
-        return slack(table, force(table, seen, duration, arc.piece, arc.row, share, s, w))[contact]
+        return pick(slack(table, force(table, seen, duration, arc.piece, arc.row, share, s, w)), contact)
 
     bend = acceleration(table, seen, duration, arc.piece, arc.row, share, s, w)
     value, slope = jax.jvp(at, (share, s, w), (jnp.ones_like(share), w, bend))
     wide = jnp.where(width > 0, width, 1.0)
-    curve = jax.grad(jax.grad(lambda xi: slacks_on(table, seen, duration, arc, xi)[contact]))(xi) / wide**2
+    curve = jax.grad(jax.grad(lambda xi: pick(slacks_on(table, seen, duration, arc, xi), contact)))(xi) / wide**2
     inner = (xi > 0) & (xi < 1) & (curve > 0)
     return value, curve, jnp.where(inner, -slope / jnp.where(inner, curve, 1.0) / wide, 0.0), slope, share, s
 
@@ -268,7 +269,7 @@ def _first_loss(table, seen, duration, steps, values):
     negative = least < 0
     first = jnp.argmax(negative.ravel())
     step, sample = first // SAMPLES, first % SAMPLES
-    arc = jax.tree.map(lambda a: a[step], steps)
+    arc = jax.tree.map(lambda a: pick(a, step), steps)
     width = 1.0 / (SAMPLES - 1)
     high = sample * width
 

@@ -4,7 +4,7 @@ import jax
 from jaxtyping import Array, Int
 
 
-def row(values: Array, number: Int[Array, ""]) -> Array:
+def pick(values: Array, number: Int[Array, ""]) -> Array:
     """`values[number]` for a number that is within the array: what else `[]` sees to, negative numbers above all, takes
     three operations each time, which is much where it happens in hundreds of places."""
     return jax.lax.dynamic_index_in_dim(values, number, keepdims=False, allow_negative_indices=False)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.contacts import constraint_rows, constraints, frames, slips
 from wholearm_jax.elimination import inverse, times
+from wholearm_jax.lookup import pick
 from wholearm_jax.precision import digits
 from wholearm_jax.scene import Heading
 from wholearm_jax.status import Status
@@ -161,8 +162,9 @@ def _begin(system, z, x, watched, tolerance, capacity) -> March:
 def _step(system, watch, tolerance, m: March) -> March:
     """Try one step: keep its node, take a shorter one, or find that the wire ends within the shortest."""
     capacity = m.s.shape[0]
-    x, u = m.x[m.n - 1], m.charts[m.number]
-    z_new, moved, inverted, determinant = correct(system, u, _predicted(m), u @ m.z[m.n - 1] + m.step, 4, tolerance)
+    last, u = m.n - 1, pick(m.charts, m.number)
+    z, x, s = pick(m.z, last), pick(m.x, last), pick(m.s, last)
+    z_new, moved, inverted, determinant = correct(system, u, _predicted(m), u @ z + m.step, 4, tolerance)
     x_new, orientation = _normalised(inverted, determinant)
     watched = watch(z_new, x_new, u)
     good = (moved < tolerance) & (x_new @ x > 0.98) & jnp.all(jnp.isfinite(x_new))
@@ -170,11 +172,11 @@ def _step(system, watch, tolerance, m: March) -> March:
     ends = good & jnp.any(crossed)
     bracketed = ends & (m.step <= SHORTEST)
     accept = good & ~jnp.any(crossed)
-    row = jnp.where(accept | bracketed, m.n, capacity)
+    place = jnp.where(accept | bracketed, m.n, capacity)
     turn = accept & (u @ x_new < 0.6)
     number = m.number + turn
     chart_row = jnp.where(turn, number, CHARTS)
-    s_new = m.s[m.n - 1] + m.step
+    s_new = s + m.step
     speeds = speeds_of(system, z_new, x_new)
     sign = signs_of(speeds, tolerance)
     flips = sign * m.sense < 0
@@ -186,15 +188,15 @@ def _step(system, watch, tolerance, m: March) -> March:
     return m._replace(
         n=m.n + (accept | bracketed),
         step=jnp.where(accept, jnp.minimum(m.step * 1.5, LONGEST), shorter),
-        z=m.z.at[row].set(z_new, mode="drop"),
-        x=m.x.at[row].set(x_new, mode="drop"),
-        s=m.s.at[row].set(s_new, mode="drop"),
+        z=m.z.at[place].set(z_new, mode="drop"),
+        x=m.x.at[place].set(x_new, mode="drop"),
+        s=m.s.at[place].set(s_new, mode="drop"),
         speeds=jnp.where(accept, speeds, m.speeds),
         sense=jnp.where(accept & (sign != 0), sign, m.sense),
-        flips=m.flips.at[row].set(jnp.append(flips, m.number != m.chart[m.n - 1]), mode="drop"),
-        share=m.share.at[row].set(jnp.append(share, 0.0), mode="drop"),
-        orientation=m.orientation.at[row].set(orientation, mode="drop"),
-        chart=m.chart.at[row].set(m.number, mode="drop"),
+        flips=m.flips.at[place].set(jnp.append(flips, m.number != pick(m.chart, last)), mode="drop"),
+        share=m.share.at[place].set(jnp.append(share, 0.0), mode="drop"),
+        orientation=m.orientation.at[place].set(orientation, mode="drop"),
+        chart=m.chart.at[place].set(m.number, mode="drop"),
         charts=m.charts.at[chart_row].set(x_new, mode="drop"),
         anchors=m.anchors.at[chart_row].set(z_new, mode="drop"),
         anchor_s=m.anchor_s.at[chart_row].set(s_new, mode="drop"),
@@ -208,15 +210,15 @@ def _step(system, watch, tolerance, m: March) -> March:
 
 def _predicted(m: March):
     """The next node, by the cubic through the last two nodes and their tangents; the first by its tangent alone."""
-    u, last = m.charts[m.number], m.n - 1
+    u, last = pick(m.charts, m.number), m.n - 1
     before = jnp.maximum(last - 1, 0)
-    z, step = m.z[last], m.step
-    slope, slope_before = m.x[last] / (u @ m.x[last]), m.x[before] / (u @ m.x[before])
-    width = jnp.where(m.n > 1, u @ (z - m.z[before]), 1.0)
-    mean = jnp.where(m.n > 1, (z - m.z[before]) / width, slope)
-    t = step / width
+    z, z_before, x, x_before = pick(m.z, last), pick(m.z, before), pick(m.x, last), pick(m.x, before)
+    slope, slope_before = x / (u @ x), x_before / (u @ x_before)
+    width = jnp.where(m.n > 1, u @ (z - z_before), 1.0)
+    mean = jnp.where(m.n > 1, (z - z_before) / width, slope)
+    t = m.step / width
     bend = (2 * slope + slope_before - 3 * mean) + (slope + slope_before - 2 * mean) * t
-    return z + step * (slope + bend * t)
+    return z + m.step * (slope + bend * t)
 
 
 def _ended(system, m: March, tolerance) -> March:

@@ -25,6 +25,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.landing import acceleration, land
+from wholearm_jax.lookup import pick
 from wholearm_jax.reduction import Table, on_panel, powers
 from wholearm_jax.schedule import Window, interval, torque_in
 from wholearm_jax.status import Status
@@ -141,7 +142,7 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     state, verdict, room = _wait(table, seen, how, free, state)
     blocked = verdict != int(Status.OK)
     last = state.piece >= table.count - 1
-    goal = table.breaks[state.piece + 1] + jnp.where(free & last, jnp.inf, 0.0)
+    goal = pick(table.breaks, state.piece + 1) + jnp.where(free & last, jnp.inf, 0.0)
     floor = jnp.where(free, -jnp.inf, 0.0)
     final = jnp.where(blocked, state.share, 1.0)
 
@@ -200,7 +201,7 @@ def _recorded(state: _State, steps: Steps, overshot, room):
     recorded = jnp.concatenate([steps.end[:, None], steps.y], axis=1)
     nodes = state.nodes.at[place].set(recorded, mode="drop")
     entered = jnp.concatenate([y0[1:], steps.y[:-1, 1]])
-    share, s, w = (nodes[start + kept, k] for k in range(3))
+    share, s, w = pick(nodes, start + kept)
     state = state._replace(
         share=share,
         s=s,
@@ -210,7 +211,7 @@ def _recorded(state: _State, steps: Steps, overshot, room):
         pieces=state.pieces.at[place - 1].set(state.piece, mode="drop"),
         count=start + kept,
     )
-    return state, complete, jnp.where(overshot, steps.end[jnp.maximum(steps.count - 1, 0)], 1.0)
+    return state, complete, jnp.where(overshot, pick(steps.end, jnp.maximum(steps.count - 1, 0)), 1.0)
 
 
 def _integrate(table, seen, duration, how, state, final, goal, floor) -> Steps:

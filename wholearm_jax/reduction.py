@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.contacts import constraint_curvature, constraint_rows, slip_rows
 from wholearm_jax.elimination import inverse, times
-from wholearm_jax.lookup import row
+from wholearm_jax.lookup import pick
 from wholearm_jax.precision import digits
 from wholearm_jax.status import Status
 from wholearm_jax.system import System, configuration_unit
@@ -204,11 +204,11 @@ def powers(table: Table, piece: Int[Array, ""], s: Float[Array, ""]) -> tuple[In
     More than a panel beyond the piece its functions stay what they are there: only steps that will be taken again, and
     intervals of an optimisation under way, come so far.
     """
-    low, high, panels = row(table.breaks, piece), row(table.breaks, piece + 1), row(table.panels, piece)
+    low, high, panels = pick(table.breaks, piece), pick(table.breaks, piece + 1), pick(table.panels, piece)
     width = jnp.where(high > low, high - low, 1.0)
     share = (s - low) / width * panels
     local = jnp.clip(jnp.floor(jax.lax.stop_gradient(share)), 0, jnp.maximum(panels - 1, 0))
-    return row(table.first, piece) + local.astype(int), jnp.clip(2 * (share - local) - 1, -3.0, 3.0)
+    return pick(table.first, piece) + local.astype(int), jnp.clip(2 * (share - local) - 1, -3.0, 3.0)
 
 
 def polynomial(coefficients: Float[Array, "powers ..."], xi: Float[Array, ""]) -> Float[Array, "..."]:
@@ -223,7 +223,7 @@ def polynomial(coefficients: Float[Array, "powers ..."], xi: Float[Array, ""]) -
 
 def on_panel(coefficients: Float[Array, "panels powers ..."], panel: Int[Array, ""], xi: Float[Array, ""]):
     """The value of one of a table's functions at the place that `powers` tells."""
-    return polynomial(row(coefficients, panel), xi)
+    return polynomial(pick(coefficients, panel), xi)
 
 
 def _place(wire, panel, at):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.lookup import row
+from wholearm_jax.lookup import pick
 
 ROWS = 128  # schedules are padded to a multiple of this: those of like length share compiled programs
 
@@ -106,4 +106,4 @@ def interval(seen: Window, share: Float[Array, ""]) -> Int[Array, ""]:
 
 def torque_in(seen: Window, number: Int[Array, ""], share: Float[Array, ""]) -> Float[Array, "2"]:
     """The torque [N m] of one interval at a share of the phase."""
-    return row(seen.values, number) + row(seen.slope, number) * (share - row(seen.share, number))
+    return pick(seen.values, number) + pick(seen.slope, number) * (share - pick(seen.share, number))

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
+from wholearm_jax.lookup import pick
 from wholearm_jax.schedule import Window, interval
 
 Loop = Literal["lax", "checkpointed", "bounded"]
@@ -91,9 +92,9 @@ def found(
     assert order is not None  # that of a stochastic solver may be
     eps = jnp.finfo(y.dtype).eps
 
-    def cut(begin, size, row):
+    def cut(begin, size, number):
         """Where a step ends: on the interval's end, rather than next to it or beyond."""
-        stop = jnp.minimum(jnp.where(row < seen.last, seen.share[row + 1], final), final)
+        stop = jnp.minimum(jnp.where(number < seen.last, pick(seen.share, number + 1), final), final)
         return jnp.where(begin + size > stop - 100 * eps, stop, begin + size)
 
     def attempt(at: _Step) -> _Step:
@@ -154,11 +155,12 @@ def repeated(field: Callable, seen: Window, how: Integration, begin, final, y, s
 
     def step(at):
         k, y, reused, ys = at
-        jumped = jumps[k] if how.steps else False
-        y, _, _, reused, _ = solver.step(term, begins[k], ends[k], y, row[k], reused, jumped)
+        jumped = pick(jumps, k) if how.steps else False
+        y, _, _, reused, _ = solver.step(term, pick(begins, k), pick(ends, k), y, pick(row, k), reused, jumped)
         return k + 1, y, reused, ys.at[k].set(y)
 
-    start = jnp.asarray(0, int), y, solver.init(term, begin, ends[0], y, row[0]), jnp.broadcast_to(y, steps.y.shape)
+    rows = jnp.zeros_like(steps.y)  # not `y`: what a row of a buffer holds before it is written keeps its derivative
+    start = jnp.asarray(0, int), y, solver.init(term, begin, ends[0], y, row[0]), rows
     *_, ys = eqxi.while_loop(
         lambda at: at[0] < count, step, start, max_steps=how.max_steps, buffers=lambda at: at[3], kind=kind
     )
