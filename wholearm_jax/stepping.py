@@ -1,9 +1,9 @@
 """Steps: how a motion is integrated, by one of diffrax's solvers, and the steps that its error chooses.
 
 The loop is the package's own, about diffrax's solver and its controller of errors: every step lies in one interval of
-the torque schedule, which is looked up once a step and not at each stage; where the next knot lies costs nothing; and
-nothing else is watched, saved or compiled. (`diffrax.diffeqsolve` compiles to a third more operations for this work;
-`benchmarks/skipping.py` has the times of both.)
+the torque schedule, which is looked up once a step and not at each stage; the next knot is the interval's end; and
+nothing else is watched, saved or compiled. By `diffrax.diffeqsolve` a motion compiles to 1.8 times as many operations;
+`benchmarks/skipping.py` compares run times.
 """
 
 from collections.abc import Callable

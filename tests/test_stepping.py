@@ -1,0 +1,74 @@
+"""Steps by their error: they end on knots, keep their length across them, and stop at the first that comes past."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.schedule import window
+from wholearm_jax.stepping import Integration, found, repeated
+
+NEVER = jnp.inf
+
+
+def spring(row, share, y):
+    """`s'' = -9 s`."""
+    return jnp.stack([y[1], -9.0 * y[0]])
+
+
+def steps_of(knots, *, past=NEVER, **how):
+    """Steps from 0 to 1 of a schedule with these knots, from `s = 1` at rest."""
+    schedule = wa.torque(knots, np.zeros((len(knots), 2)))
+    seen, how = window(schedule, jnp.zeros(()), jnp.ones(())), Integration(**how)
+    one = jnp.ones(())
+    y = jnp.stack([one, 0 * one])
+    steps = jax.jit(lambda y: found(spring, seen, how, 0 * one, one, y, lambda y: y[0] < past, one))(y)
+    return steps, seen, how, y
+
+
+def test_steps_end_on_every_knot_and_on_the_end():
+    knots = [0.0, 0.013, 0.21, 0.2100001, 0.7, 1.0]
+    steps, *_ = steps_of(knots, tolerance=1e-12)
+    count = int(steps.count)
+    assert bool(steps.complete) and not bool(steps.passed)
+    assert set(knots[1:]) <= set(np.asarray(steps.end[:count]).tolist())
+    assert np.all(np.diff(steps.end[:count]) > 0)
+    assert np.asarray(steps.y[count - 1]) == pytest.approx([np.cos(3.0), -3 * np.sin(3.0)], abs=1e-11)
+    inside = np.searchsorted(knots, (np.append(0.0, steps.end[: count - 1]) + steps.end[:count]) / 2) - 1
+    np.testing.assert_array_equal(steps.row[:count], inside)
+
+
+def test_a_sliver_before_a_knot_does_not_make_the_steps_after_it_short():
+    plain, *_ = steps_of([0.0, 0.5, 1.0])
+    sliver, *_ = steps_of([0.0, 0.5, 0.5 + 1e-13, 1.0])
+    assert int(sliver.count) == int(plain.count) + 1
+
+
+def test_the_first_step_that_comes_past_is_the_last():
+    steps, *_ = steps_of([0.0, 1.0], past=0.3)
+    count = int(steps.count)
+    assert bool(steps.passed) and bool(steps.complete)
+    assert np.all(steps.y[: count - 1, 0] >= 0.3) and steps.y[count - 1, 0] < 0.3
+
+
+def test_steps_that_run_out_are_not_complete():
+    steps, *_ = steps_of(np.linspace(0.0, 1.0, 33), max_steps=16)
+    assert int(steps.count) == 16 and not bool(steps.complete)
+
+
+@pytest.mark.parametrize("adjoint", ["forward", "reverse", "both"])
+def test_repeated_steps_are_those_found_and_have_derivatives(adjoint):
+    steps, seen, how, y = steps_of([0.0, 0.4, 1.0], tolerance=1e-12)
+    how = Integration(tolerance=1e-12, adjoint=adjoint)
+
+    def end(y):
+        again = repeated(spring, seen, how, jnp.zeros(()), jnp.ones(()), y, steps)
+        return again.y[steps.count - 1]
+
+    np.testing.assert_array_equal(end(y), steps.y[steps.count - 1])
+    matrix = np.array([[np.cos(3.0), np.sin(3.0) / 3], [-3 * np.sin(3.0), np.cos(3.0)]])
+    if adjoint != "reverse":
+        np.testing.assert_allclose(jax.jacfwd(end)(y), matrix, atol=1e-11)
+    if adjoint != "forward":
+        np.testing.assert_allclose(jax.jacrev(end)(y), matrix, atol=1e-11)
