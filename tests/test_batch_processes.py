@@ -31,9 +31,10 @@ def command():
 
 
 def start(command, store: Path, *more: str, devices: int = 1) -> subprocess.Popen:
-    """Begin the command in a process of its own, which shares the tests' compiled programs."""
-    kept = {"JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"]}
-    environment = {**os.environ, "MPLBACKEND": "agg", **kept, "JAX_NUM_CPU_DEVICES": str(devices)}
+    """Begin the command in a process of its own, which keeps its programs in a folder that the tests share."""
+    told = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    kept = {"XDG_CACHE_HOME": jax.config.values["jax_compilation_cache_dir"]}
+    environment = {**told, "MPLBACKEND": "agg", **kept, "JAX_NUM_CPU_DEVICES": str(devices)}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "env": environment}
     return subprocess.Popen([*command, "--out", str(store), *more], **pipes)
 

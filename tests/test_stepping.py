@@ -9,7 +9,7 @@ import wholearm_jax as wa
 from wholearm_jax.schedule import window
 from wholearm_jax.stepping import Integration, found, repeated
 
-NEVER = jnp.inf
+NEVER = -jnp.inf
 
 
 def spring(row, share, y):
@@ -31,7 +31,8 @@ def test_steps_end_on_every_knot_and_on_the_end():
     knots = [0.0, 0.013, 0.21, 0.2100001, 0.7, 1.0]
     steps, *_ = steps_of(knots, tolerance=1e-12)
     count = int(steps.count)
-    assert bool(steps.complete) and not bool(steps.passed)
+    assert bool(steps.complete)
+    assert not bool(steps.passed)
     assert set(knots[1:]) <= set(np.asarray(steps.end[:count]).tolist())
     assert np.all(np.diff(steps.end[:count]) > 0)
     assert np.asarray(steps.y[count - 1]) == pytest.approx([np.cos(3.0), -3 * np.sin(3.0)], abs=1e-11)
@@ -48,13 +49,16 @@ def test_a_sliver_before_a_knot_does_not_make_the_steps_after_it_short():
 def test_the_first_step_that_comes_past_is_the_last():
     steps, *_ = steps_of([0.0, 1.0], past=0.3)
     count = int(steps.count)
-    assert bool(steps.passed) and bool(steps.complete)
-    assert np.all(steps.y[: count - 1, 0] >= 0.3) and steps.y[count - 1, 0] < 0.3
+    assert bool(steps.passed)
+    assert bool(steps.complete)
+    assert np.all(steps.y[: count - 1, 0] >= 0.3)
+    assert steps.y[count - 1, 0] < 0.3
 
 
 def test_steps_that_run_out_are_not_complete():
     steps, *_ = steps_of(np.linspace(0.0, 1.0, 33), max_steps=16)
-    assert int(steps.count) == 16 and not bool(steps.complete)
+    assert int(steps.count) == 16
+    assert not bool(steps.complete)
 
 
 @pytest.mark.parametrize("adjoint", ["forward", "reverse", "both"])

@@ -33,6 +33,7 @@ from wholearm_jax.plan import (
     trace_told,
 )
 from wholearm_jax.precision import require_x64
+from wholearm_jax.programs import Program
 from wholearm_jax.result import Result
 from wholearm_jax.scene import Formation, Scene, body
 from wholearm_jax.schedule import Torque, padded
@@ -211,17 +212,27 @@ def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):
     return columns
 
 
-@eqx.filter_jit
 def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Level, mesh: Mesh):
     """Check `BLOCK` scenes a device."""
+    if mesh.size == 1:
+        return _check_here(source, numbers, schedule, arrival, level)
+    return _check_apart(source, numbers, schedule, arrival, level, mesh)
+
+
+@Program
+def _check_here(source: Source, numbers, schedule: Torque, arrival, level: Level):
+    """Check scenes on one device."""
+    return jax.vmap(lambda n: check_scene(source.draw(n), schedule, arrival, level))(numbers)
+
+
+@eqx.filter_jit
+def _check_apart(source: Source, numbers, schedule: Torque, arrival, level: Level, mesh: Mesh):
+    """Check scenes on several devices, each with loops of its own."""
     arrays, static = eqx.partition(source, eqx.is_array)
 
     def local(arrays, numbers, schedule, arrival):
-        from_here = eqx.combine(arrays, static)
-        return jax.vmap(lambda n: check_scene(from_here.draw(n), schedule, arrival, level))(numbers)
+        return _check_here.plain(eqx.combine(arrays, static), numbers, schedule, arrival, level)
 
-    if mesh.size == 1:
-        return local(arrays, numbers, schedule, arrival)
     each, whole = PartitionSpec("scenes"), PartitionSpec()
     mapped = jax.shard_map(local, mesh=mesh, in_specs=(whole, each, whole, whole), out_specs=each, check_vma=False)
     return mapped(arrays, numbers, schedule, arrival)
