@@ -24,6 +24,8 @@ def pushed():
 
 @pytest.fixture(autouse=True)
 def closed():
+    """Each test begins without a figure, whatever the ones before it have left open, and leaves none."""
+    plt.close("all")
     yield
     plt.close("all")
 
