@@ -94,7 +94,7 @@ def bare(table, seen, duration, terms=(0, 1, 2, 3, 4), stop=False):
 def stepped(table, seen, duration):
     """The same stage with all terms, by the package's own loop."""
 
-    def field(row, u, y):
+    def field(u, y, row):
         return jnp.stack([y[1], acceleration(table, seen, duration, 0, row, u, y[0], y[1])])
 
     y, final = jnp.stack([table.breaks[0], jnp.zeros(())]), jnp.ones(())

@@ -12,7 +12,7 @@ from wholearm_jax.stepping import Integration, found, repeated
 NEVER = -jnp.inf
 
 
-def spring(row, share, y):
+def spring(share, y, row):
     """`s'' = -9 s`."""
     return jnp.stack([y[1], -9.0 * y[0]])
 

@@ -220,7 +220,7 @@ def _integrate(table, seen, duration, how, state, final, goal, floor) -> Steps:
     def solve(method, inputs, *more):
         table, seen, duration, share, y0 = inputs
 
-        def field(row, u, y):
+        def field(u, y, row):
             return jnp.stack([y[1], acceleration(table, seen, duration, state.piece, row, u, y[0], y[1])])
 
         return method(field, seen, how, share, final, y0, *more)

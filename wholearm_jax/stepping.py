@@ -83,11 +83,11 @@ def found(
 ) -> Steps:
     """Steps by their error from `begin` to `final`, or to the first that comes `past(y)`; each ends at a knot at most.
 
-    `field(row, share, y)` is `dy/du` in an interval of the schedule. The first step is a 32nd of the phase, or half of
+    `field(share, y, row)` is `dy/du` in an interval of the schedule. The first step is a 32nd of the phase, or half of
     `way` at the speed there, if that is shorter.
     """
     errors = dfx.PIDController(rtol=how.tolerance, atol=how.tolerance)
-    solver, term = _with_stages(how.solver, "lax"), dfx.ODETerm(lambda u, y, row: field(row, u, y))
+    solver, term = _with_stages(how.solver, "lax"), dfx.ODETerm(field)
     order = solver.error_order(term)
     assert order is not None  # that of a stochastic solver may be
     eps = jnp.finfo(y.dtype).eps
@@ -150,7 +150,7 @@ def repeated(field: Callable, seen: Window, how: Integration, begin, final, y, s
     ends = jnp.where(count > 0, ends, begin)
     begins = jnp.concatenate([begin[None], ends[:-1]])
     kind = LOOPS[how.adjoint]
-    solver, term = _with_stages(how.solver, kind), dfx.ODETerm(lambda u, y, row: field(row, u, y))
+    solver, term = _with_stages(how.solver, kind), dfx.ODETerm(field)
     jumps = jnp.append(False, row[1:] != row[:-1])
 
     def step(at):
