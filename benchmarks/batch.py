@@ -35,8 +35,6 @@ from wholearm_jax.batch import BLOCK, QUICK, check_scene
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.variation import vary
 
-jax.config.update("jax_enable_x64", True)
-
 HERE = Path(__file__).parent
 COUNTS = (128, 1024, 8192, 65_536)
 ALIKE = 65_536
@@ -240,6 +238,7 @@ def draw(found: dict, path: Path) -> None:
 
 def main() -> None:
     """Measure, save, draw, print."""
+    wa.configure(compiled="well")
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small batches of checks alone; nothing is written")
     parser.add_argument("--only", help="measure this part anew, e.g. check")

@@ -38,8 +38,6 @@ from wholearm_jax.schedule import padded
 from wholearm_jax.squeeze import holds
 from wholearm_jax.stepping import Integration
 
-jax.config.update("jax_enable_x64", True)
-
 KNOTS, DEGREE = 31, 3
 FINE = 120  # collocation intervals of the best that is known
 FIT = 1e-10  # relative error of the series that stand for the table
@@ -514,6 +512,7 @@ def _unpack(programme: Programme, x: np.ndarray) -> tuple[Course, np.ndarray]:
 
 
 def main() -> None:
+    wa.configure()
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--duration", type=float, default=1.0, help="of every phase [s]")
     parser.add_argument("--knots", type=int, default=KNOTS, help="torques a joint")

@@ -10,7 +10,6 @@ largest distance of the centre of mass from its predicted place over the whole p
 import argparse
 from pathlib import Path
 
-import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from measure import RESULTS, save
@@ -19,8 +18,6 @@ import wholearm_jax as wa
 from wholearm_jax.execution import execute
 from wholearm_jax.free_bodies import Softness
 from wholearm_jax.palette import LINK_COLOURS as COLOURS
-
-jax.config.update("jax_enable_x64", True)
 
 DATA = Path(__file__).parents[1] / "tests" / "data"
 SCENES = ("heptagon", "hexagon")
@@ -78,6 +75,7 @@ def draw(found: dict) -> plt.Figure:
 
 
 def main() -> None:
+    wa.configure()
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="fewer and coarser executions; nothing is written")
     quick = parser.parse_args().quick

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from random_plans import _grasps, random_object, write
@@ -23,8 +22,6 @@ from wholearm_jax.formations import Way, leaving, ways
 from wholearm_jax.phase import start_configuration
 from wholearm_jax.scene import Phase, formation, heading
 from wholearm_jax.scene_file import to_dict
-
-jax.config.update("jax_enable_x64", True)
 
 SHORTEST, LEAST_BOUND, SLOWED = 0.2, 0.2, 0.2  # wire [object radii], bound [N], speed after an impact over that before
 
@@ -80,6 +77,7 @@ def _phase(number: int, way: Way, duration: float, last: bool) -> Phase:
 
 
 def main() -> None:
+    wa.configure()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)

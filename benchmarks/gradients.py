@@ -30,8 +30,6 @@ from wholearm_jax.forces import score
 from wholearm_jax.motion import move
 from wholearm_jax.schedule import Torque, padded, window
 
-jax.config.update("jax_enable_x64", True)
-
 HERE = Path(__file__).parent
 KNOTS = (4, 8, 16, 32, 64, 128)
 ADJOINTS = {"forward": "forward", "reverse": "reverse", "direct": "both"}
@@ -169,6 +167,7 @@ def tabulate(found: dict) -> None:
 
 def main() -> None:
     """Measure, save, draw, print."""
+    wa.configure()
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one phase, fewer knots and tolerances")
     quick = parser.parse_args().quick

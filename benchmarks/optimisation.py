@@ -31,8 +31,6 @@ from random_plans import random_plans
 
 import wholearm_jax as wa
 
-jax.config.update("jax_enable_x64", True)
-
 BUNDLED, RANDOM = (1.0, 0.3, 0.15), (1.0, 0.3)  # durations of a phase [s]
 PLANS, SEED = 12, 0
 USUAL = inspect.signature(wa.optimise).parameters["knots"].default
@@ -86,6 +84,7 @@ class Case:
 
 
 def main() -> None:
+    wa.configure()
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="bundled plans and four random ones, 1.0 s; saves nothing")
     parser.add_argument("--knots", type=int, default=USUAL, help="torques a joint and phase, for both optimisers")

@@ -51,8 +51,6 @@ from wholearm_jax.schedule import padded
 from wholearm_jax.squeeze import coefficients
 from wholearm_jax.status import Status
 
-jax.config.update("jax_enable_x64", True)
-
 KNOTS, TIMESTEP = 51, 5e-5  # [s]
 TOLERANCE = Tolerance()
 FREE = 5e-3  # [s] without force from which a contact counts as lost; shorter is chatter of the contact's softness
@@ -492,6 +490,7 @@ def draw(rows: list[dict]) -> plt.Figure:
 
 
 def main() -> None:
+    wa.configure()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for sort, count in SORTS.items():
         parser.add_argument(f"--{sort}", type=int, default=count, help=f"{sort} plans")

@@ -15,14 +15,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 import wholearm_jax as wa
 from wholearm_jax.phase import ending
 from wholearm_jax.scene_file import to_dict
-
-jax.config.update("jax_enable_x64", True)
 
 VERTICES = (5, 9)  # least and most
 RADIUS = (0.034, 0.048)  # of the circle that the vertices lie in or near [m]
@@ -171,6 +168,7 @@ def _held_to(plan: dict[str, Any], coordinate: int, least: float) -> str | None:
 
 
 def main() -> None:
+    wa.configure()
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--count", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)

@@ -30,8 +30,6 @@ from wholearm_jax.schedule import interval, torque_in
 from wholearm_jax.stepping import found
 from wholearm_jax.wire import Resolution
 
-jax.config.update("jax_enable_x64", True)
-
 COARSE = Resolution(6, 16, 8)
 
 
@@ -162,6 +160,7 @@ def _margin(table, seen, duration, values):
 
 def main() -> None:
     """Measure, save, print."""
+    wa.configure()
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer repeats")
     repeats = 3 if parser.parse_args().quick else 9

@@ -9,8 +9,9 @@ reference is SciPy's DOP853 at 1e-13 on all five coordinates, which shares nothi
 object comes to rest, and times within `APART` of a slip reversal, where forces jump, do not count.
 
 Every time is that of one phase, warm, taken in turn. The package is timed as `move` alone, as simulating and scoring
-(`run`), and with tracing and tabulating the wire included; all is done again in a second process where XLA compiles
-loops whole (`WHOLE`). For each error level the ratio is between the fastest runs that are at least as good.
+(`run`), and with tracing and tabulating the wire included. All of JAX's programs, of both sides, are compiled as
+`wholearm_jax.configure` says, and again in a second process as XLA does by itself (`PLAIN`). For each error level the
+ratio is between the fastest runs that are at least as good.
 """
 
 import argparse
@@ -50,11 +51,12 @@ from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
 from wholearm_jax.system import system
 
-jax.config.update("jax_enable_x64", True)
-
 HERE = Path(__file__).parent
-WHOLE = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
-"""XLA compiles a loop on the CPU as one kernel where it counts as small; this makes every loop small."""
+PLAIN = (
+    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1024 "
+    "--xla_cpu_use_fusion_emitters=true --xla_backend_optimization_level=3"
+)
+"""XLA's own choices, which `configure` then leaves."""
 
 APART = 1e-4  # shares of the phase around a slip reversal that do not count
 STOP = {"knots": 0.999}  # the share up to which runs that come to rest are compared
@@ -68,7 +70,7 @@ SHOWN = {
     "package": ("the package: move", "#0072B2", "o"),
     "package, run": ("simulate and score", "#56B4E9", "s"),
     "package, trace and run": ("trace, simulate and score", "#009E73", "D"),
-    "whole": ("move, loops compiled whole", "#000000", "v"),
+    "plain": ("move, XLA by itself", "#000000", "v"),
     "Newton in the field": ("Newton in the vector field", "#D55E00", "^"),
     "un-reduced DOP853": ("SciPy, un-reduced", "#CC79A7", "P"),
     "bare loop": ("bare loop (numba)", "#999999", "x"),
@@ -325,13 +327,13 @@ def _ratio(rows: list[dict], against: list[dict], level: float) -> float | None:
 # --- output -----------------------------------------------------------------------------------------------------------
 
 
-def draw(found: dict, whole: dict, path: Path) -> None:
+def draw(found: dict, plain: dict, path: Path) -> None:
     """Time against error, a panel for each problem."""
     plt.rcParams |= {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
     figure, axes = plt.subplots(2, 2, figsize=(7.2, 5.6), sharex=True, sharey=True, layout="constrained")
     for ax, (problem, rows) in zip(axes.flat, found.items(), strict=True):
         for name, (label, colour, marker) in SHOWN.items():
-            front = _front(whole[problem]["package"] if name == "whole" else rows[name])
+            front = _front(plain[problem]["package"] if name == "plain" else rows[name])
             if front:
                 ax.loglog(*zip(*front, strict=True), marker=marker, color=colour, ms=3.5, lw=1.2, label=label)
         ax.set_title(problem, loc="left")
@@ -389,19 +391,20 @@ def main() -> None:
     parser.add_argument("--print", choices=("all", "times"), help="measure here and print rows as JSON")
     given = parser.parse_args()
     if given.print:
+        wa.configure()
         print(json.dumps(everything(given.quick, given.print == "all")))
         return
     quick = ["--quick"] if given.quick else []
-    found, whole = _in_process("--print=all", *quick), _in_process("--print=times", *quick, flags=WHOLE)
-    for problem, rows in whole.items():
+    found, plain = _in_process("--print=all", *quick), _in_process("--print=times", *quick, flags=PLAIN)
+    for problem, rows in plain.items():
         for name, timed in rows.items():
             for row, known in zip(timed, found[problem][name], strict=True):
                 row["error"] = known["error"]
         rows["un-reduced DOP853"] = found[problem]["un-reduced DOP853"]
-    tables = {"as installed": ratios(found, "package"), "loops compiled whole": ratios(whole, "package")}
-    runs = {"as installed": found, "loops compiled whole": whole}
-    path = measure.save("work_precision", {"levels": LEVELS, "flag": WHOLE, "ratios": tables, "runs": runs})
-    draw(found, whole, path.with_suffix(".svg"))
+    tables = {"configured": ratios(found, "package"), "XLA's own choices": ratios(plain, "package")}
+    runs = {"configured": found, "XLA's own choices": plain}
+    path = measure.save("work_precision", {"levels": LEVELS, "flags": PLAIN, "ratios": tables, "runs": runs})
+    draw(found, plain, path.with_suffix(".svg"))
     for name, table in tables.items():
         print(f"\n{name.upper()}")
         tabulate(table, "package")

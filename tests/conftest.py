@@ -7,11 +7,11 @@ import jax
 import pytest
 
 from wholearm_jax import command
+from wholearm_jax.settings import configure
 
 MAPPED = 30_000  # half of the memory areas that Linux grants a process by default
 
-jax.config.update("jax_enable_x64", True)
-command.compile_quickly()
+configure()
 
 
 def pytest_collection_modifyitems(items):

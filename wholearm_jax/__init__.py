@@ -15,6 +15,7 @@ from wholearm_jax.sampling import trajectory
 from wholearm_jax.scene import Scene
 from wholearm_jax.scene_file import load, parse, save
 from wholearm_jax.schedule import Torque, torque
+from wholearm_jax.settings import configure
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
 
@@ -25,6 +26,7 @@ __all__ = [
     "Torque",
     "bounds",
     "check",
+    "configure",
     "load",
     "margin",
     "optimise",

@@ -27,6 +27,7 @@ from wholearm_jax.arguments import (
 from wholearm_jax.batch_command import ARRIVAL, check, ensemble, optimise_robustly
 from wholearm_jax.execution_command import execute
 from wholearm_jax.programs import keep
+from wholearm_jax.settings import configure
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -46,10 +47,8 @@ def main() -> None:
     # Solving small systems on several threads costs more than it gains: they wait for one another, spinning.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("MPLBACKEND", "agg")
-    jax.config.update("jax_enable_x64", True)
+    configure(compiled="well" if sys.argv[1:2] == ["check"] else "quickly")
     _keep_compiled()
-    if sys.argv[1:2] != ["check"]:  # many scenes at once run longer than they compile
-        compile_quickly()
     from wholearm_jax.scene_file import SceneError
 
     try:
@@ -68,19 +67,6 @@ def _keep_compiled() -> None:
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     keep(Path(folder, "programs"))
-
-
-def compile_quickly() -> None:
-    """Have XLA emit kernels in its older way: half of the compile time, at a tenth more run time for one scene; and
-    optimise them little: a tenth less again, at no run time that can be measured.
-
-    XLA refuses flags that it does not know: this is for the version that was measured. What a user sets stays.
-    """
-    given = os.environ.get("XLA_FLAGS", "")
-    quick = ("--xla_cpu_use_fusion_emitters=false", "--xla_backend_optimization_level=1")
-    added = [flag for flag in quick if flag.partition("=")[0] not in given]
-    if jax.__version_info__[:2] == (0, 10):
-        os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
 
 
 @app.command()

@@ -11,6 +11,4 @@ def digits(values, share: float):
 def require_x64() -> None:
     """Raise unless JAX computes in 64 bits: the statuses' tolerances need them."""
     if jnp.zeros(()).dtype != jnp.float64:
-        raise RuntimeError(
-            "this function needs float64; call jax.config.update('jax_enable_x64', True) before importing arrays"
-        )
+        raise RuntimeError("this function needs float64; call wholearm_jax.configure() before JAX computes anything")

@@ -1,0 +1,45 @@
+"""What XLA is told: every loop compiled as one function, whatever a user has set left alone."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax import settings
+
+
+def test_a_loop_is_one_function():
+    def go(x):
+        return jax.lax.fori_loop(0, 100, lambda _, x: jnp.sin(x), x)
+
+    assert "xla_cpu_small_call" in jax.jit(go).lower(jnp.ones(1000)).compile().as_text()
+
+
+@pytest.mark.parametrize(
+    ("compiled", "given", "left"),
+    [
+        ("quickly", "", [*settings.ALWAYS, *settings.QUICKLY]),
+        ("well", "", [*settings.ALWAYS]),
+        ("well", "--xla_dump_to=here", ["--xla_dump_to=here", *settings.ALWAYS]),
+        (
+            "quickly",
+            "--xla_cpu_use_fusion_emitters=true --xla_backend_extra_options=one=2",
+            ["--xla_cpu_use_fusion_emitters=true", "--xla_backend_extra_options=one=2", settings.QUICKLY[1]],
+        ),
+    ],
+)
+def test_what_a_user_has_set_stays(monkeypatch, compiled, given, left):
+    monkeypatch.setenv("XLA_FLAGS", given)
+    wa.configure(compiled=compiled)
+    assert settings.os.environ["XLA_FLAGS"].split() == left
+    wa.configure(compiled=compiled)
+    assert settings.os.environ["XLA_FLAGS"].split() == left
+
+
+def test_another_version_of_jax_is_told_nothing(monkeypatch):
+    """XLA refuses flags that it does not know."""
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(jax, "__version_info__", (0, 99, 0))
+    wa.configure()
+    assert settings.os.environ["XLA_FLAGS"] == ""
+    assert jnp.zeros(()).dtype == jnp.float64

@@ -1,0 +1,28 @@
+"""Settings: what JAX and XLA are told before they start, by the command line as by a script or a notebook."""
+
+import os
+from typing import Literal
+
+import jax
+
+ALWAYS = ("--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000",)
+QUICKLY = ("--xla_cpu_use_fusion_emitters=false", "--xla_backend_optimization_level=1")
+MEASURED = (0, 10)  # XLA refuses flags that it does not know: these are for the version of JAX that was measured
+
+
+def configure(*, compiled: Literal["quickly", "well"] = "quickly") -> None:
+    """Set JAX to 64 bits, and tell XLA how to compile for a CPU. Call it before JAX computes anything.
+
+    Every loop becomes one function: by default XLA runs a loop of such small steps as a sequence of kernels, each of
+    which costs more to start than it computes. A margin takes 0.75 of the time then, its gradient 0.2 to 0.3. Compiled
+    `"quickly"`, as suits single scenes, kernels come from XLA's older emitters and are optimised little: half of the
+    compile time. Compiled `"well"`, as suits `check`, very many scenes run faster by half. What `XLA_FLAGS` in the
+    environment says already stays as it is.
+    """
+    jax.config.update("jax_enable_x64", True)
+    if jax.__version_info__[:2] != MEASURED:
+        return
+    given = os.environ.get("XLA_FLAGS", "")
+    wanted = (*ALWAYS, *(QUICKLY if compiled == "quickly" else ()))
+    added = [flag for flag in wanted if flag.partition("=")[0] not in given]
+    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
