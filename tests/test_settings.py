@@ -8,6 +8,12 @@ import wholearm_jax as wa
 from wholearm_jax import settings
 
 
+@pytest.fixture(autouse=True)
+def _jax_has_begun():
+    """What these tests write to the environment comes too late for this process."""
+    jax.devices()
+
+
 def test_a_loop_is_one_function():
     def go(x):
         return jax.lax.fori_loop(0, 100, lambda _, x: jnp.sin(x), x)

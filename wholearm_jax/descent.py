@@ -254,7 +254,8 @@ class Descent(NamedTuple):
     `least` is each phase's smallest sampled force over its unit and `apart` the sum of the defects, both of the
     variables before the step (NaN where those were not kept). `reach` is the part of a step that is taken. `merit` is
     that of the variables before the step at the temperature `hot`, and `rise` the most by which the step may raise it;
-    `damping` the price of the step's size (of the interior point's).
+    where that is infinite the merit is not computed, and is infinite too. `damping` is the price of the step's size (of
+    the interior point's).
     """
 
     p: Variables
@@ -304,7 +305,8 @@ def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimis
     linear = linearise(d.p, tables, limits, how)
     at = linear.at
     sound = jnp.all(jnp.isfinite(at.room)) & jnp.all(jnp.isfinite(linear.defect))
-    better = merit(linear, d.hot, d.state.joining) <= d.merit + d.rise
+    held = jnp.isfinite(d.rise)
+    better = jax.lax.cond(held, lambda: merit(linear, d.hot, d.state.joining) <= d.merit + d.rise, lambda: held | True)
     least = jnp.where((at.weight > 0) & (linear.bears > 0), at.room, jnp.inf).min((1, 2))
     apart = _apart(linear)
 
@@ -312,7 +314,7 @@ def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimis
         flat, unravel = ravel_pytree(d.p)
         way, state = optimiser.update(jnp.zeros_like(flat), d.state, flat, linear=linear, damping=d.damping)
         hot = d.state.temperature
-        here = merit(linear, hot, state.joining)
+        here = jax.lax.cond(held, lambda: merit(linear, hot, state.joining), lambda: jnp.full_like(d.merit, jnp.inf))
         return Descent(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart, d.reach, d.rise, d.damping, here, hot)
 
     def again():

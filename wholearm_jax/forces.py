@@ -199,12 +199,20 @@ def smooth_margin(values, weights, temperature: Float[Array, ""]) -> tuple[Float
     low = jnp.where(live, fixed, jnp.inf).min()
     heaviest = jnp.where(live & (fixed <= low), weights, 0.0).max()
 
-    def step(_, m):
+    def step(at):
+        m, _, count = at
         room = jnp.where(live, fixed - m, 1.0)
         over = temperature * (weights / room).sum() - 1.0
-        return m - over / (temperature * (weights / room**2).sum())
+        move = over / (temperature * (weights / room**2).sum())
+        return m - move, jnp.abs(move), count + 1
 
-    m = stop_gradient(jax.lax.fori_loop(0, 40, step, low - temperature * heaviest))
+    def going(at):
+        m, moved, count = at
+        return (count < 40) & (moved > 4 * jnp.finfo(m.dtype).eps * (jnp.abs(m) + temperature))
+
+    begin = stop_gradient(low - temperature * heaviest)
+    m, *_ = jax.lax.while_loop(going, step, (begin, jnp.full_like(begin, jnp.inf), 0))
+    m = stop_gradient(m)
     return m + temperature * (weights * jnp.log(jnp.where(live, values - m, 1.0) / temperature)).sum(), m
 
 

@@ -40,6 +40,8 @@ GOOD = 0.99  # share of the bound with which no further start is tried
 RISE = 0.01  # most that a step which is held back may raise the merit, as a share of the bound
 DAMPING, DAMPED = 1e-8, 1.3  # price of its size, and by how much that grows from one such step to the next
 CLOSE = 1e-5  # sum of the defects from which full steps close them
+SETTLED, NEARLY = 0.05, 1e-2  # shares of the tolerance by which a margin that settled changes, sum of its defects
+CLOSING = 1e3  # price of a step's size beside which the margin counts little: the smallest step that joins intervals
 LOST = 1e-6  # share of a step at which a descent gives up
 
 
@@ -284,8 +286,8 @@ def _optimise_group(
 
 def _descend(task: _Task, start: Variables, number: int, limits: Limits, method, callback):
     """One descent: the variables at its end, why it ended, and its steps."""
-    tables, history = task.tables, []
-    d, rounds = begin(start, method), 0
+    tables, top, history = task.tables, task.bounds.min(), []
+    d, rounds, margin_before = begin(start, method), 0, np.nan
     why = f"the limit of {task.steps} steps"
     for count in range(task.steps):
         begun = time.perf_counter()
@@ -303,10 +305,13 @@ def _descend(task: _Task, start: Variables, number: int, limits: Limits, method,
         if share < LOST:
             return d.p, "no step leads on", history
         # Full steps lead on fastest, but may go round in a circle for ever: where knots pass kinks of the wire to and
-        # fro, and along ways that the loss hardly sees. Who circles is held back, more and more.
-        circling = count >= task.steps // 3 and apart > CLOSE
-        rounds += circling
-        d = after._replace(**(_held_back(rounds) if circling else _FULL))
+        # fro, and along ways that the loss hardly sees. Who circles is held back, more and more; and once the margin
+        # has settled, steps only join the intervals: that converges quadratically, as the interior point does not.
+        near = least.min() >= 1 - task.tolerance / 2 or abs(margin - margin_before) < SETTLED * task.tolerance * top
+        settled = hot <= coldest and apart < NEARLY and near
+        circling = not settled and count >= task.steps // 3 and apart > CLOSE
+        rounds, margin_before = rounds + circling, margin
+        d = after._replace(**(_JOINING if settled else _held_back(rounds) if circling else _FULL))
     return d.p, why, history
 
 
@@ -346,6 +351,7 @@ def _method(optimiser, phases: int):
 _ONE = np.ones(())
 _HOW = Integration()
 _FULL = {"reach": _ONE, "rise": np.full((), np.inf), "damping": np.zeros(())}
+_JOINING = _FULL | {"damping": np.full((), CLOSING)}
 
 
 def _evenly(duration, values) -> Torque:

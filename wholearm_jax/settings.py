@@ -18,6 +18,8 @@ def configure(*, compiled: Literal["quickly", "well"] = "quickly") -> None:
     `"quickly"`, as suits single scenes, kernels come from XLA's older emitters and are optimised little: half of the
     compile time. Compiled `"well"`, as suits `check`, very many scenes run faster by half. What `XLA_FLAGS` in the
     environment says already stays as it is.
+
+    >>> wa.configure()
     """
     jax.config.update("jax_enable_x64", True)
     if jax.__version_info__[:2] != MEASURED:
