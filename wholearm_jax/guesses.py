@@ -7,11 +7,11 @@ import itertools
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from wholearm_jax.linearisation import passed_on
 from wholearm_jax.phase import Traced
+from wholearm_jax.precision import array
 from wholearm_jax.programs import Program
 from wholearm_jax.shooting import Variables
 from wholearm_jax.squeeze import holds
@@ -54,8 +54,9 @@ def guesses(traced: list[Traced], durations, knots: int, share: float) -> list[V
 def _squeezed(table, time: float, motions, share: float):
     """Torques at the knots, in units of their limits, and least forces [N] of motions given FINE places an interval."""
     full = np.asarray(table.torque_limit)
-    tight = eqx.tree_at(lambda t: t.torque_limit, table, jnp.asarray(share * full))
-    length, first = float(table.length), float(table.breaks[0])
+    tight = eqx.tree_at(lambda t: t.torque_limit, table, array(share * full))
+    breaks = np.asarray(table.breaks)
+    length, first = float(breaks[-1] - breaks[0]), float(breaks[0])
     s, v, a = (np.stack(rows) for rows in zip(*motions, strict=True))
     held = _holds(tight, first + length * s, length * v / time, length * a / time**2)
     return np.clip(np.asarray(held.torque)[:, ::FINE] / full, -share, share), np.asarray(held.margin).min(1)
@@ -64,7 +65,7 @@ def _squeezed(table, time: float, motions, share: float):
 def _variables(torques, motions, durations) -> Variables:
     state = np.stack([np.stack(motion[:2], axis=1)[::FINE] for motion in motions])
     state[:, 0, 0], state[:, -1, 0], state[-1, -1, 1] = 0.0, 1.0, 0.0
-    return Variables(jnp.asarray(np.stack(torques)), jnp.asarray(state), jnp.asarray(np.log(durations)))
+    return Variables(array(np.stack(torques)), array(state), array(np.log(durations)))
 
 
 def _between(knots: int, entry: float, leave: float):

@@ -23,7 +23,7 @@ from wholearm_jax.guesses import guesses
 from wholearm_jax.linearisation import Limits
 from wholearm_jax.phase import Traced, balance_at_start, run
 from wholearm_jax.plan import outcomes, stacked, trace
-from wholearm_jax.precision import require_x64
+from wholearm_jax.precision import array, require_x64
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import blank
 from wholearm_jax.result import Result, describe, stays
@@ -119,7 +119,7 @@ def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...
 
     def top(at, phase, begin):
         if phase.arrive != "hold":
-            return _bound(at.table, phase.duration, jnp.asarray(begin), jnp.asarray(phase.arrive == "rest"))
+            return _bound(at.table, phase.duration, array(begin), array(phase.arrive == "rest"))
         known = int(at.table.status) == Status.OK
         if not known:
             return Bound(jnp.asarray(-np.inf), at.table.breaks[0], jnp.zeros(()))
@@ -181,7 +181,7 @@ def optimise(
         found += schedules
         stopped += [why] * len(group)
         history += taken
-    lengths = [f.times[-1] for f in found]
+    lengths = [float(np.asarray(f.times)[-1]) for f in found]
     phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, lengths, strict=True))
     scene = eqx.tree_at(lambda s: s.phases, scene, phases)
     torque = _in_turn(found)
@@ -334,11 +334,11 @@ def _compile(phases: int, knots: int, rows: int, method) -> None:
     table = blank(Resolution())
     tables = _stacked([table] * phases)
     plain = (np.full(2, np.inf), _ONE, _ONE, np.zeros((phases, knots), bool), np.ones(phases))
-    limits = Limits(*(jnp.asarray(a) for a in plain))
+    limits = Limits(*(array(a) for a in plain))
     empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
-    p = Variables(*(jnp.asarray(a) for a in empty))
+    p = Variables(*(array(a) for a in empty))
     advance(begin(p, method), tables, limits, _HOW, method)
-    zero, one = jnp.asarray(np.zeros(())), jnp.asarray(_ONE)
+    zero, one = array(0.0), array(1.0)
     run(table, padded(_evenly(1.0, empty[0][0]), rows), zero, one, Integration(), "rest")
 
 
@@ -355,7 +355,7 @@ _JOINING = _FULL | {"damping": np.full((), CLOSING)}
 
 
 def _evenly(duration, values) -> Torque:
-    return Torque(jnp.asarray(np.linspace(0.0, float(duration), len(values))), jnp.asarray(values))
+    return Torque(array(np.linspace(0.0, float(duration), len(values))), array(values))
 
 
 _stacked = jax.jit(stacked)
@@ -387,9 +387,9 @@ def _honest(scene: Scene, task: _Task, p: Variables) -> tuple[bool, float]:
 
 def _in_turn(schedules: list[Torque]) -> Torque:
     """Schedules one after the other; a step where one follows another."""
-    begins = np.cumsum([0.0, *(float(s.times[-1]) for s in schedules[:-1])])
+    begins = np.cumsum([0.0, *(float(np.asarray(s.times)[-1]) for s in schedules[:-1])])
     times = [begin + np.asarray(s.times) for begin, s in zip(begins, schedules, strict=True)]
-    return Torque(*(jnp.asarray(np.concatenate(rows)) for rows in (times, [s.values for s in schedules])))
+    return Torque(*(array(np.concatenate(rows)) for rows in (times, [np.asarray(s.values) for s in schedules])))
 
 
 _bound = Program(bound)
@@ -402,4 +402,4 @@ def _limits(task: _Task, rate_limit, durations, before) -> Limits:
     pinned = np.zeros((len(lengths), task.knots), bool)
     pinned[0, 0] = before is not None
     unit = np.maximum(task.bounds, 1e-300)
-    return Limits(*(jnp.asarray(a) for a in (rate, shortest * _ONE, longest * _ONE, pinned, unit)))
+    return Limits(*(array(a) for a in (rate, shortest * _ONE, longest * _ONE, pinned, unit)))

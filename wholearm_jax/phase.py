@@ -14,6 +14,7 @@ from wholearm_jax.contacts import GROUPS, PALM_END, ROOT
 from wholearm_jax.forces import Score, score
 from wholearm_jax.holding import Departure, Statics, statics
 from wholearm_jax.motion import Motion, move
+from wholearm_jax.precision import array
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Change, Table, change, on_panel, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, contact_name
@@ -63,10 +64,10 @@ def run(
     `arrival` how near the wire's end the phase must come (`verdict`).
     """
     dtype = table.breaks.dtype
-    arriving = jnp.asarray(np.zeros(5), dtype) if arriving is None else arriving
-    start, duration, arrival = (jnp.asarray(a, dtype) for a in (start, duration, arrival))
+    arriving = array(np.zeros(5), dtype) if arriving is None else arriving
+    start, duration, arrival = (array(a, dtype) for a in (start, duration, arrival))
     how = tolerance_as_data(how, dtype)
-    goal = jnp.asarray(GOALS[goal] if isinstance(goal, str) else goal, int)
+    goal = array(GOALS[goal] if isinstance(goal, str) else goal, int)
     return _run(table, schedule, start, duration, arriving, how, goal, arrival)
 
 

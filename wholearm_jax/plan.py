@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wholearm_jax.phase import Outcome, Traced, destination, end_configuration, prepare, run, start_configuration
-from wholearm_jax.precision import digits, require_x64
+from wholearm_jax.precision import array, digits, require_x64
 from wholearm_jax.programs import transformed
 from wholearm_jax.result import Result, describe
 from wholearm_jax.scene import Body, Phase, Scene, body
@@ -107,7 +107,7 @@ def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, toleranc
         traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, resolution)
         table = traced.table
         least_error = ROUNDING * jnp.finfo(table.breaks.dtype).eps
-        coarse = bool(table.error > max(tolerance, least_error)) and int(table.status) == Status.OK
+        coarse = float(table.error) > max(tolerance, least_error) and int(table.status) == Status.OK
         full = int(table.count) >= resolution.pieces
         if full and resolution.pieces < 48:
             resolution = resolution._replace(pieces=2 * resolution.pieces, panels=2 * resolution.panels)
@@ -144,22 +144,34 @@ def _outcomes_together(phases, schedule: Torque, how: Integration, arrival) -> O
 
 def simulate_first(torque: Torque):
     """When a plan begins, when it should, and at which `z_dot`: what `simulate_next` needs of the phases before."""
-    zero = jnp.zeros((), torque.times.dtype)
-    return zero, zero, jnp.zeros(5, zero.dtype)
+    zero = array(0.0, torque.times.dtype)
+    return zero, zero, array(np.zeros(5), zero.dtype)
 
 
 def simulate_told(phase: Phase):
     """What a plan says of a phase's motion: its duration, its goal, and whether the next takes over at speed."""
-    return phase.duration, jnp.asarray(GOALS[phase.arrive], int), jnp.asarray(phase.arrive == "moving")
+    return phase.duration, array(GOALS[phase.arrive], int), array(phase.arrive == "moving")
 
 
 def simulate_next(schedule: Torque, how: Integration, arrival, at, phase):
     """Simulate the next phase of a plan, from when the one before it ended: one step of a scan."""
     (start, planned, arriving), (table, duration, goal, passes) = at, phase
-    planned = planned + duration
-    one = run(table, schedule, start, planned - start, how, goal, arriving, arrival)
-    ended = start + one.duration * one.motion.share[one.motion.count]
-    return (jnp.where(passes, ended, planned), planned, jnp.where(passes, one.leaving, 0.0)), one
+    planned, length = _planned(planned, duration, start)
+    one = run(table, schedule, start, length, how, goal, arriving, arrival)
+    return _following(planned, passes, one), one
+
+
+@jax.jit  # outside of other programs, one compiles sooner than its operations one by one
+def _planned(before, duration, start):
+    """When a phase should end, and how long it has."""
+    return before + duration, before + duration - start
+
+
+@jax.jit
+def _following(planned, passes, one: Outcome):
+    """When the next phase begins, when this one should have ended, and at which `z_dot`."""
+    ended = one.start + one.duration * one.motion.share[one.motion.count]
+    return jnp.where(passes, ended, planned), planned, jnp.where(passes, one.leaving, 0.0)
 
 
 def margin(

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from wholearm_jax.contacts import constraint_curvature, constraint_rows, slip_rows
 from wholearm_jax.elimination import inverse, times
 from wholearm_jax.lookup import pick
-from wholearm_jax.precision import digits
+from wholearm_jax.precision import array, digits
 from wholearm_jax.status import Status
 from wholearm_jax.system import System, configuration_unit
 from wholearm_jax.wire import Resolution, Wire, chebyshev
@@ -162,15 +162,15 @@ def reduce_wire(system: System, wire: Wire) -> Table:
 def blank(resolution: Resolution, contacts: int = 4) -> Table:
     """A table of the right shapes that holds no wire: something to compile with."""
     pieces, panels, nodes, _ = resolution
-    zero, whole = jnp.asarray(np.zeros(())), jnp.asarray(np.zeros((), int))
+    zero, whole, one = array(0.0), array(0), array(1)
     each = {name: np.zeros((panels, nodes, n)) for name, n in (("acceleration", 5), ("backward", 3))}
     each |= {name: np.zeros((panels, nodes, 5)) for name in ("configuration", "velocity")}
     each |= {"force": np.zeros((panels, nodes, contacts, TERMS)), "tension": np.zeros((pieces, contacts))}
     each |= {"breaks": np.arange(pieces + 1.0), "factor": np.ones(pieces), "torque_limit": np.ones(2)}
     each |= {"tangential": np.zeros(contacts, bool), "grip": np.zeros(contacts)}
     each |= {"entry": np.zeros((5, 5)), "first": np.zeros(pieces, int), "panels": np.ones(pieces, int)}
-    filled = {name: jnp.asarray(value) for name, value in each.items()}
-    return Table(count=whole + 1, error=zero, condition=zero, condition_s=zero, status=whole, **filled)
+    filled = {name: array(value) for name, value in each.items()}
+    return Table(count=one, error=zero, condition=zero, condition_s=zero, status=whole, **filled)
 
 
 class Change(eqx.Module):

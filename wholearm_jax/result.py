@@ -116,7 +116,7 @@ def describe(scene: Scene, torque: Torque, traced, found) -> Result:
             margin_time=start + length * float(scored.share),
             margin_s=float(scored.s),
             margin_contact=names[of_slot[int(scored.contact)]],
-            impulses=tuple(float(outcome.entered.impulse[k]) for k in phase.formation.normal_slots),
+            impulses=tuple(float(np.asarray(outcome.entered.impulse)[k]) for k in phase.formation.normal_slots),
             holds=stays(scene, torque, phase, at, outcome),
             traced=at,
             outcome=outcome,

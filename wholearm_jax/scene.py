@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from wholearm_jax.precision import array
+
 COORDINATES = ("x", "y", "phi", "theta1", "theta2")
 LINKS = ("palm", "finger1", "finger2")
 VERTEX, EDGE = 0, 1  # contact types: A, an object vertex on a link; B, a fingertip on an object edge
@@ -157,12 +159,12 @@ def polygon(vertices, mass, friction, inertia=None, center_of_mass=None) -> Poly
     given = np.asarray(vertices, float)
     padding = np.broadcast_to(given[-1], (-len(given) % 8, 2))
     return Polygon(
-        vertices=jnp.asarray(np.concatenate([given, padding])),
-        count=jnp.asarray(len(given), int),
-        mass=jnp.asarray(mass, float),
-        friction=jnp.asarray(np.broadcast_to(np.asarray(friction, float), (3,))),
-        inertia=None if inertia is None else jnp.asarray(inertia, float),
-        center_of_mass=None if center_of_mass is None else jnp.asarray(center_of_mass, float),
+        vertices=array(np.concatenate([given, padding])),
+        count=array(len(given), int),
+        mass=array(mass, float),
+        friction=array(np.broadcast_to(np.asarray(friction, float), (3,))),
+        inertia=None if inertia is None else array(inertia, float),
+        center_of_mass=None if center_of_mass is None else array(center_of_mass, float),
     )
 
 
@@ -171,7 +173,7 @@ def formation(contacts) -> Formation:
     rows = []
     for *feature, rolling in map(parse_contact, contacts):
         rows += [(*feature, tangential) for tangential in (False, True)[: 1 + rolling]]
-    return Formation(*(jnp.asarray(np.asarray(column)) for column in zip(*rows, strict=True)))
+    return Formation(*(array(column) for column in zip(*rows, strict=True)))
 
 
 def heading(toward: str | None, until: Mapping[Any, float] | None = None) -> Heading:
@@ -179,10 +181,10 @@ def heading(toward: str | None, until: Mapping[Any, float] | None = None) -> Hea
     to stop at."""
     coordinate, value = next(iter(until.items())) if until else (None, 0.0)
     return Heading(
-        coordinate=jnp.asarray(COORDINATES.index(toward[:-1]) if toward else -1, int),
-        sign=jnp.asarray(-1.0 if toward and toward[-1] == "-" else 1.0, float),
-        until_coordinate=jnp.asarray(-1 if coordinate is None else COORDINATES.index(coordinate), int),
-        until_value=jnp.asarray(value, float),
+        coordinate=array(COORDINATES.index(toward[:-1]) if toward else -1, int),
+        sign=array(-1.0 if toward and toward[-1] == "-" else 1.0, float),
+        until_coordinate=array(-1 if coordinate is None else COORDINATES.index(coordinate), int),
+        until_value=array(value, float),
     )
 
 
@@ -239,4 +241,4 @@ def body(shape: Polygon) -> Body:
 
 def replace_duration(phase: Phase, duration) -> Phase:
     """A phase with another duration."""
-    return eqx.tree_at(lambda p: p.duration, phase, jnp.asarray(duration, float))
+    return eqx.tree_at(lambda p: p.duration, phase, array(duration, float))

@@ -7,7 +7,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-import jax.numpy as jnp
 import numpy as np
 import tomli_w
 from pydantic import (
@@ -22,6 +21,7 @@ from pydantic import (
     model_validator,
 )
 
+from wholearm_jax.precision import array
 from wholearm_jax.scene import COORDINATES, LINKS, Hand, Phase, Scene, formation, heading, parse_contact, polygon
 from wholearm_jax.writing import write_whole
 
@@ -267,12 +267,12 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
     gravity = checked.gravity if isinstance(checked.gravity, tuple) else (0.0, -checked.gravity)
     return Scene(
         title=checked.title,
-        gravity=jnp.asarray(gravity),
-        hand=Hand(*(jnp.asarray([getattr(f, key) for f in fingers]) for key in Hand.__dataclass_fields__)),
+        gravity=array(gravity),
+        hand=Hand(*(array([getattr(f, key) for f in fingers]) for key in Hand.__dataclass_fields__)),
         object=polygon(shape.vertices, shape.mass, each, shape.inertia, shape.center_of_mass),
-        start=jnp.asarray([getattr(checked.start, c) for c in COORDINATES]),
+        start=array([getattr(checked.start, c) for c in COORDINATES]),
         phases=tuple(
-            Phase(p.name, formation(p.contacts), heading(p.toward, p.until), jnp.asarray(p.duration, float), _arrive(p))
+            Phase(p.name, formation(p.contacts), heading(p.toward, p.until), array(p.duration, float), _arrive(p))
             for p in checked.phase
         ),
     )

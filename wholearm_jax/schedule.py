@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from wholearm_jax.lookup import pick
+from wholearm_jax.precision import array
 
 ROWS = 128  # schedules are padded to a multiple of this: those of like length share compiled programs
 
@@ -48,7 +49,7 @@ def torque(times, values) -> Torque:
     Traceback (most recent call last):
     ValueError: times must not decrease, and none may stand more than twice
     """
-    times, values = jnp.asarray(times, float), jnp.asarray(values, float)
+    times, values = array(times, float), array(values, float)
     clock = np.asarray(times)
     if clock.ndim != 1 or clock.size < 2 or values.shape != (clock.size, 2):
         raise ValueError("a torque schedule needs at least two rows of t, tau1, tau2")

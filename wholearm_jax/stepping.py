@@ -18,6 +18,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.lookup import pick
+from wholearm_jax.precision import array
 from wholearm_jax.schedule import Window, interval
 
 Loop = Literal["lax", "checkpointed", "bounded"]
@@ -46,7 +47,7 @@ class Integration(eqx.Module):
 
 def tolerance_as_data(how: Integration, dtype) -> Integration:
     """The same integration, with a tolerance that is an array: all tolerances share a program."""
-    return eqx.tree_at(lambda h: h.tolerance, how, jnp.asarray(how.tolerance, dtype))
+    return eqx.tree_at(lambda h: h.tolerance, how, array(how.tolerance, dtype))
 
 
 class Steps(NamedTuple):
