@@ -132,6 +132,14 @@ def draw(found: dict, path: Path) -> None:
     plt.close(figure)
 
 
+def tabulate(name: str, result: dict) -> None:
+    """One command's times."""
+    for kind, seconds in result["seconds"].items():
+        print(f"{name}, {kind}: first result {seconds['first']:.1f} s, exit {seconds['exit']:.1f} s")
+    for kind, parts in result["apart"].items():
+        print(f"  {kind}: " + ", ".join(f"{part} {value:.1f}" for part, value in parts.items()), flush=True)
+
+
 def main() -> None:
     """Measure, save, draw, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -140,14 +148,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         run(COMMANDS["optimise"], Path(folder, "cache"), Path(folder, "out"))
         torque = Path(folder, "out", "torque.csv")
-        found = {name: measured(name, command, repeats, torque) for name, command in COMMANDS.items()}
+        found = {}
+        for name, command in COMMANDS.items():
+            found[name] = measured(name, command, repeats, torque)
+            tabulate(name, found[name])
     path = measure.save("cold_start", found)
     draw(found, path.with_suffix(".svg"))
-    for name, result in found.items():
-        for kind, seconds in result["seconds"].items():
-            print(f"{name}, {kind}: first result {seconds['first']:.1f} s, exit {seconds['exit']:.1f} s")
-        for kind, parts in result["apart"].items():
-            print(f"  {kind}: " + ", ".join(f"{part} {value:.1f}" for part, value in parts.items()))
 
 
 if __name__ == "__main__":

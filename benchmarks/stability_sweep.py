@@ -14,6 +14,7 @@ from stability_model import Model, dot
 from stability_programs import FLOATS, GAUSS, follower, forward, reverse, tracer
 from stability_scenes import Scenes, draw
 
+from wholearm_jax.settings import configure
 from wholearm_jax.stepping import Integration
 from wholearm_jax.wire import Resolution
 
@@ -67,6 +68,7 @@ DIFFERENTIATED = 32  # scenes whose gradients are computed at once
 
 def work(blocks, seed, *, single, target: Path):
     """Run blocks of scenes and write one record a scene."""
+    configure(compiled="well")
     jax.config.update("jax_enable_x64", not single)
     records = []
     for block in blocks:

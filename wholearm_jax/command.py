@@ -85,7 +85,7 @@ def optimise(
     out: Out = None,
     set_: Changes = None,
     knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase.")] = 51,
-    steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 120,
+    steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 160,
     rate_limit: Annotated[float | None, typer.Option(min=0.0, help="Largest torque rate [N m/s].")] = None,
     samples: Annotated[
         int | None, typer.Option(min=2, help="Rows a phase in trajectory.csv (201), or samples.")

@@ -15,7 +15,7 @@ from wholearm_jax.scene import Scene
 from wholearm_jax.schedule import Torque
 from wholearm_jax.stepping import Integration, tolerance_as_data
 
-FORWARD = 16
+FORWARD = 4
 
 
 def torque_gradient(

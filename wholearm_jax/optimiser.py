@@ -133,7 +133,7 @@ def optimise(
     scene: Scene,
     *,
     knots: int = 51,
-    steps: int = 120,
+    steps: int = 160,
     rate_limit: float | None = None,
     durations: tuple[float, float] | None = None,
     optimiser: optax.GradientTransformation | None = None,
