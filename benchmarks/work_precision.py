@@ -8,8 +8,9 @@ line in time, the smoothest that a schedule can hold. A run's error is the large
 reference is SciPy's DOP853 at 1e-13 on all five coordinates, which shares nothing with the package. Both end before the
 object comes to rest, and times within `APART` of a slip reversal, where forces jump, do not count.
 
-Every time is that of one phase, warm, taken in turn. The package is timed as `move` alone, as simulating and scoring
-(`run`), and with tracing and tabulating the wire included. All of JAX's programs, of both sides, are compiled as
+Every time is that of one phase, warm, taken in turn. The package is timed as `move` alone, called from Python and, as
+a share of `MANY` phases that follow one another, within a program; as simulating and scoring (`run`); and with tracing
+and tabulating the wire included. All of JAX's programs, of both sides, are compiled as
 `wholearm_jax.configure` says, and again in a second process as XLA does by itself (`PLAIN`). For each error level the
 ratio is between the fastest runs that are at least as good.
 """
@@ -58,6 +59,7 @@ PLAIN = (
 )
 """XLA's own choices, which `configure` then leaves."""
 
+MANY = 64  # phases of one program that share the cost of its call
 APART = 1e-4  # shares of the phase around a slip reversal that do not count
 STOP = {"knots": 0.999}  # the share up to which runs that come to rest are compared
 LEVELS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
@@ -68,7 +70,8 @@ TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 SCIPY = tuple(10.0**-k for k in range(4, 13))
 SHOWN = {
     "package": ("the package: move", "#0072B2", "o"),
-    "package, run": ("simulate and score", "#56B4E9", "s"),
+    "package, within a program": ("move, within a program", "#56B4E9", "*"),
+    "package, run": ("simulate and score", "#E69F00", "s"),
     "package, trace and run": ("trace, simulate and score", "#009E73", "D"),
     "plain": ("move, XLA by itself", "#000000", "v"),
     "Newton in the field": ("Newton in the vector field", "#D55E00", "^"),
@@ -169,6 +172,12 @@ def _move(table: Table, seen: Window, duration, how: wa.Integration) -> Motion:
 
 
 @eqx.filter_jit
+def _moves(table: Table, seen: Window, durations, how: wa.Integration) -> Motion:
+    """One phase after the other."""
+    return jax.lax.map(lambda duration: move(table, seen, duration, how=how), durations)
+
+
+@eqx.filter_jit
 def _at_steps(table: Table, schedule, start, duration, motion: Motion):
     """`z`, `z_dot`, `c_n` at the motion's steps."""
     there = sample(table, schedule, start, duration, motion, motion.share)
@@ -196,8 +205,10 @@ def package(problem: Problem, solver: str, tolerance: float):
         traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading)
         return run(traced.table, *here, how, "moving")
 
+    durations = problem.duration * (1 + 1e-12 * jnp.arange(MANY))
     calls = {
         "package": lambda: _move(table, problem.seen, problem.duration, how),
+        "package, within a program": lambda: _moves(table, problem.seen, durations, how),
         "package, run": lambda: run(table, *here, how, "moving"),
         "package, trace and run": again,
     }
@@ -280,6 +291,7 @@ def in_turn(problem: Problem, solver: str, tolerance: float, repeats: int) -> di
         calls |= own
         rows |= {name: {"solver": solver, "tolerance": tolerance, "error": wrong, "steps": steps} for name in own}
     times = measure.compare(calls, repeats=repeats)
+    times = {name: seconds / (MANY if "within" in name else 1) for name, seconds in times.items()}
     return {name: row | {"seconds": times[name]} for name, row in rows.items()}
 
 
