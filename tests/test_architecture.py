@@ -4,9 +4,12 @@ import ast
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 import wholearm_jax as wa
 from wholearm_jax.phase import _run, prepare
+from wholearm_jax.scene import polygon
 
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
@@ -90,3 +93,22 @@ def test_scenes_of_one_size_share_their_programs():
         sizes = (prepare.plain._cached._cache_size(), _run.plain._cached._cache_size())
         count(sizes)
     assert len(compiled) == 1, f"a later scene compiled again: {compiled}"
+
+
+def test_reading_scenes_and_schedules_compiles_nothing():
+    """`jnp.asarray` of what is no array yet compiles a program for every shape, in every process anew."""
+    compiled = []
+
+    def listen(event, _, **__):
+        compiled.append(event)
+
+    angle = np.linspace(0.0, 2 * np.pi, 37, endpoint=False)  # sizes that no other test has
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        polygon(np.stack([np.cos(angle), np.sin(angle)], axis=1), 1.0, 0.1)
+        wa.torque(np.linspace(0.0, 1.0, 37), np.zeros((37, 2)))
+        assert "/jax/core/compile/backend_compile_duration" not in compiled
+        jnp.arange(37.0) + 1
+        assert "/jax/core/compile/backend_compile_duration" in compiled  # the listener hears what is compiled
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
