@@ -164,7 +164,8 @@ def simulate_next(schedule: Torque, how: Integration, arrival, at, phase):
 @jax.jit  # outside of other programs, one compiles sooner than its operations one by one
 def _planned(before, duration, start):
     """When a phase should end, and how long it has."""
-    return before + duration, before + duration - start
+    planned = before + duration
+    return planned, planned - start
 
 
 @jax.jit

@@ -1,4 +1,4 @@
-"""Precision: what counts as zero, and what needs 64 bits."""
+"""Precision: what counts as zero, what needs 64 bits, and numbers as arrays of the precision that JAX has."""
 
 import jax
 import jax.numpy as jnp
