@@ -2,8 +2,8 @@
 
 Read the modules in this order: `scene`, `contacts`, `system`, `march`, `start`, `places` and `wire` (trace),
 `reduction` (reduce), `schedule`, `stepping`, `landing` and `motion` (simulate), `forces` (score), `verdict`, `phase`,
-`result` and `plan`, `squeeze` (quasi-static torques and the bound), `shooting`, `linearisation`, `descent`, `guesses`
-and `optimiser` (optimise), `baseline` (the paper's search), `variation` and `batch` (many scenes at once).
+`result` and `plan`, `squeeze` (quasi-static torques and the bound), `shooting`, `linearisation`, `descent`, `pacing`,
+`guesses` and `optimiser` (optimise), `baseline` (the paper's search), `variation` and `batch` (many scenes at once).
 """
 
 from wholearm_jax.baseline import search

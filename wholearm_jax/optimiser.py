@@ -2,12 +2,11 @@
 
 Phases that begin and end at rest have each their own problem; those that follow one another at speed have one together;
 those that hold the object have the best torque of its statics (`holding`).
-It starts from the quasi-static torques of a smooth motion, descends (`descent`) while the temperature of the smooth
+It starts from the quasi-static torques of a smooth motion, descends (`pacing`) while the temperature of the smooth
 margin falls, and keeps the best schedule whose honest simulation succeeds.
 """
 
 import functools
-import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -18,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.descent import JOINED, advance, begin, interior_point, projected
+from wholearm_jax.descent import advance, begin, interior_point, projected
 from wholearm_jax.guesses import guesses
 from wholearm_jax.linearisation import Limits
+from wholearm_jax.pacing import HOW, Problem, Step, descend
 from wholearm_jax.phase import Traced, balance_at_start, run
 from wholearm_jax.plan import outcomes, stacked, trace
 from wholearm_jax.precision import array, require_x64
@@ -37,26 +37,6 @@ from wholearm_jax.wire import Resolution
 
 TORQUE_SHARE = 0.9  # share of the torque limits that a start may use
 GOOD = 0.99  # share of the bound with which no further start is tried
-RISE = 0.01  # most that a step which is held back may raise the merit, as a share of the bound
-DAMPING, DAMPED = 1e-8, 1.3  # price of its size, and by how much that grows from one such step to the next
-CLOSE = 1e-5  # sum of the defects from which full steps close them
-SETTLED, NEARLY = 0.05, 1e-2  # shares of the tolerance by which a margin that settled changes, sum of its defects
-CLOSING = 1e3  # price of a step's size beside which the margin counts little: the smallest step that joins intervals
-LOST = 1e-6  # share of a step at which a descent gives up
-
-
-@dataclass(frozen=True)
-class Step:
-    """One step of the descent from one of a phase's starts: the temperature as a share of the bound, the least sampled
-    force [N], how far apart the intervals still are (`shooting`), the time it took [s]."""
-
-    phase: int
-    start: int
-    step: int
-    temperature: float
-    margin: float
-    apart: float
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -226,9 +206,10 @@ class _Task:
     def bounds(self) -> np.ndarray:
         return np.array([float(top.value) for top in self.tops])
 
-    @property
-    def tables(self):
-        return _stacked([at.table for at in self.traced])
+    def problem(self, limits: Limits) -> Problem:
+        """What is descended on."""
+        tables = _stacked([at.table for at in self.traced])
+        return Problem(self.index, tables, self.bounds, limits, self.steps, self.tolerance)
 
 
 def _steady(scene: Scene, phase: Phase, at: Traced, knots: int, rate_limit=None, before=None) -> Torque:
@@ -272,7 +253,7 @@ def _optimise_group(
         if before is not None:
             limit = task.traced[0].table.torque_limit
             start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[0, 0].set(before / limit))
-        p, why, taken = _descend(task, start, number, limits, method, callback)
+        p, why, taken = descend(task.problem(limits), start, number, method, callback)
         history += taken
         key = _honest(scene, task, p)
         agree = key[0] and best_key[0] and abs(key[1] - best_key[1]) <= task.tolerance
@@ -282,43 +263,6 @@ def _optimise_group(
             break
     reached = best_key[0] and best_key[1] >= 1 - task.tolerance
     return _schedules(task, best), f"within {task.tolerance:g} of the bound" if reached else reason, history
-
-
-def _descend(task: _Task, start: Variables, number: int, limits: Limits, method, callback):
-    """One descent: the variables at its end, why it ended, and its steps."""
-    tables, top, history = task.tables, task.bounds.min(), []
-    d, rounds, margin_before = begin(start, method), 0, np.nan
-    why = f"the limit of {task.steps} steps"
-    for count in range(task.steps):
-        begun = time.perf_counter()
-        after = advance(d, tables, limits, _HOW, method)
-        least, apart, hot, coldest, shares, share = jax.device_get(
-            (after.least, after.apart, after.state.temperature, after.state.coldest, after.state.steps, after.share)
-        )
-        margin = float((least * task.bounds).min())
-        step = Step(task.index, number, count, float(hot), margin, float(apart), time.perf_counter() - begun)
-        history.append(step)
-        if callback is not None:
-            callback(step)
-        if apart < JOINED and hot <= coldest and (shares.min() >= 1 or least.min() >= 1 - task.tolerance):
-            return d.p, "the margin no longer improves", history
-        if share < LOST:
-            return d.p, "no step leads on", history
-        # Full steps lead on fastest, but may go round in a circle for ever: where knots pass kinks of the wire to and
-        # fro, and along ways that the loss hardly sees. Who circles is held back, more and more; and once the margin
-        # has settled, steps only join the intervals: that converges quadratically, as the interior point does not.
-        near = least.min() >= 1 - task.tolerance / 2 or abs(margin - margin_before) < SETTLED * task.tolerance * top
-        settled = hot <= coldest and apart < NEARLY and near
-        circling = not settled and count >= task.steps // 3 and apart > CLOSE
-        rounds, margin_before = rounds + circling, margin
-        d = after._replace(**(_JOINING if settled else _held_back(rounds) if circling else _FULL))
-    return d.p, why, history
-
-
-def _held_back(rounds: int) -> dict[str, np.ndarray]:
-    """How far steps go after so many that circled."""
-    settings = {"reach": 0.5, "rise": RISE, "damping": DAMPING * DAMPED**rounds}
-    return {name: np.full((), value) for name, value in settings.items()}
 
 
 @functools.cache
@@ -337,7 +281,7 @@ def _compile(phases: int, knots: int, rows: int, method) -> None:
     limits = Limits(*(array(a) for a in plain))
     empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
     p = Variables(*(array(a) for a in empty))
-    advance(begin(p, method), tables, limits, _HOW, method)
+    advance(begin(p, method), tables, limits, HOW, method)
     zero, one = array(0.0), array(1.0)
     run(table, padded(_evenly(1.0, empty[0][0]), rows), zero, one, Integration(), "rest")
 
@@ -349,9 +293,6 @@ def _method(optimiser, phases: int):
 
 
 _ONE = np.ones(())
-_HOW = Integration()
-_FULL = {"reach": _ONE, "rise": np.full((), np.inf), "damping": np.zeros(())}
-_JOINING = _FULL | {"damping": np.full((), CLOSING)}
 
 
 def _evenly(duration, values) -> Torque:
