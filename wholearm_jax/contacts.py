@@ -137,7 +137,7 @@ def frames(several: Contacts, z: Float[Array, "5"]) -> Frame:
     (px, py), (ex, ey), (jx, jy), (first, second) = map(
         components, (several.point, several.edge, several.joint, several.finger)
     )
-    cosines, sines = jnp.cos(z[2:]), jnp.sin(z[2:])
+    cosines, sines = _cosines_and_sines(z[2:])
     c, s = cosines[0], sines[0]
     dx = (1 - first - second) + first * cosines[1] + second * cosines[2]  # along the link
     dy = first * sines[1] + second * sines[2]
@@ -159,6 +159,21 @@ def frames(several: Contacts, z: Float[Array, "5"]) -> Frame:
     )
 
 
+@jax.custom_jvp
+def _cosines_and_sines(angles):
+    """Both by the tangent of the half angle, which XLA computes once: on a CPU it computes cosines and sines again in
+    each element of all that they are part of, which takes five times as long as everything else about a contact."""
+    half = jnp.tan(angles / 2)
+    square = half * half
+    return (1 - square) / (1 + square), 2 * half / (1 + square)
+
+
+@_cosines_and_sines.defjvp
+def _(primals, tangents):
+    cosines, sines = _cosines_and_sines(*primals)
+    return (cosines, sines), (-sines * tangents[0], cosines * tangents[0])
+
+
 def gaps(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "contacts"]:
     """The C-functions `C_n(z)` [m]: 0 in contact, positive apart."""
     return frames(several, z).gap
@@ -176,39 +191,94 @@ def slip_rows(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "contacts
     return _velocity_rows(several, at, _turned(at.normal))
 
 
+def rates(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]):
+    """How fast gaps open and places move `along` their features, where `z` moves at the rate `x`."""
+    at = frames(several, z)
+    return (
+        _velocities(several, at, at.normal, x),
+        _sense(several) * _velocities(several, at, _turned(at.normal), x),
+    )
+
+
 @jax.jit
 def slips(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "slots"]:
     """`G_t x` of the contacts that may slip; 0 for those that roll."""
-    return jnp.where(several.slides, slip_rows(several, z) @ x, 0.0)
+    at = frames(several, z)
+    return jnp.where(several.slides, _velocities(several, at, _turned(at.normal), x), 0.0)
 
 
 @jax.jit
 def constraints(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "slots"]:
     """What a formation keeps at zero: gaps `C_n(z)`, and `C_t(z)` in the tangential rows of rolling contacts."""
     at = frames(several, z)
-    sense = jnp.where(several.on_link, several.side, -1.0)
-    return jnp.where(several.tangential, sense * (at.along - several.held), at.gap)
+    return jnp.where(several.tangential, _sense(several) * (at.along - several.held), at.gap)
 
 
 @jax.jit
 def constraint_rows(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "slots 5"]:
     """The gradient `G` of `constraints`: `G_n`, and `G_t` in the tangential rows."""
     at = frames(several, z)
-    return _velocity_rows(several, at, jnp.where(several.tangential[:, None], _turned(at.normal), at.normal))
+    return _velocity_rows(several, at, _constrained(several, at))
+
+
+def constraint_rates(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "slots"]:
+    """`G x`, without the rows: a few sums a contact, where only they are wanted."""
+    at = frames(several, z)
+    return _velocities(several, at, _constrained(several, at), x)
 
 
 def constraint_curvature(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "slots"]:
-    """`x^T (d2C/dz2) x` for each constraint: what `G x' = -x^T H x` needs."""
-    _, rate = jax.jvp(lambda at: constraint_rows(several, at) @ x, (z,), (x,))
-    return rate
+    """`x^T (d2C/dz2) x` for each constraint: what `G x' = -x^T H x` needs.
+
+    A constraint is `u . r`: a direction `u` on the link (type A) or the object (B), turning at the rate `w`, and the
+    way `r` from a point of the same body to one of the other. Along `z + x t` its second derivative is
+    `-w^2 u.r + 2 w S u.r' + u.r''`, and `r''` points back to the centres that both points turn about.
+    """
+    at, on, (dx, dy), turn = frames(several, z), several.on_link, (x[0], x[1]), x[2]
+    swing = several.finger[:, 0] * x[3] + several.finger[:, 1] * x[4]
+    (nx, ny), (ox, oy), (jx, jy) = ((a[:, 0], a[:, 1]) for a in (at.normal, at.from_object, at.from_joint))
+    rx, ry = ny * at.along - nx * at.gap, -nx * at.along - ny * at.gap  # B: from the edge's start to the tip
+    rx, ry = jnp.where(on, jx, rx), jnp.where(on, jy, ry)
+    bx, by = jnp.where(on, ox, ox - rx), jnp.where(on, oy, oy - ry)  # the object's point, from its origin
+    rate = jnp.where(on, 1.0, -1.0)
+    swept = jnp.where(on, 0.0, swing)
+    vx = rate * (dx - turn * by) - swept * jy
+    vy = rate * (dy + turn * bx) + swept * jx
+    ax = -rate * turn**2 * bx - swept**2 * jx
+    ay = -rate * turn**2 * by - swept**2 * jy
+    w = jnp.where(on, swing, turn)
+    ux, uy = jnp.where(several.tangential, ny, nx), jnp.where(several.tangential, -nx, ny)
+    return rate * (ux * ax + uy * ay - w**2 * (ux * rx + uy * ry) + 2 * w * (ux * vy - uy * vx))
+
+
+def _sense(several: Contacts) -> Float[Array, "slots"]:
+    """The sign by which slip, that of the object against the link, moves a contact `along` its feature."""
+    return jnp.where(several.on_link, several.side, -1.0)
+
+
+def _constrained(several: Contacts, at: Frame) -> Float[Array, "slots 2"]:
+    """The direction in which each constraint keeps the object from moving: the normal, or the tangent."""
+    return jnp.where(several.tangential[:, None], _turned(at.normal), at.normal)
 
 
 def _velocity_rows(several: Contacts, at: Frame, direction: Float[Array, "slots 2"]) -> Float[Array, "slots 5"]:
     """Rows whose product with `z_dot` is the velocity along a direction at the contact, the object against the link."""
+    ux, uy, turn, arm = _moments(at, direction)
+    return jnp.stack([ux, uy, turn, arm * several.finger[:, 0], arm * several.finger[:, 1]], axis=1)
+
+
+def _velocities(several: Contacts, at: Frame, direction: Float[Array, "slots 2"], x) -> Float[Array, "slots"]:
+    """Those rows times `x`."""
+    ux, uy, turn, arm = _moments(at, direction)
+    swing = several.finger[:, 0] * x[3] + several.finger[:, 1] * x[4]
+    return ux * x[0] + uy * x[1] + turn * x[2] + arm * swing
+
+
+def _moments(at: Frame, direction: Float[Array, "slots 2"]):
+    """A direction's components, and its moments about the object's origin and, the other way, the link's joint."""
     ux, uy = direction[:, 0], direction[:, 1]
     turn = uy * at.from_object[:, 0] - ux * at.from_object[:, 1]
-    arm = ux * at.from_joint[:, 1] - uy * at.from_joint[:, 0]
-    return jnp.stack([ux, uy, turn, arm * several.finger[:, 0], arm * several.finger[:, 1]], axis=1)
+    return ux, uy, turn, ux * at.from_joint[:, 1] - uy * at.from_joint[:, 0]
 
 
 def _turned(normal: Float[Array, "contacts 2"]) -> Float[Array, "contacts 2"]:

@@ -13,10 +13,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.lax import stop_gradient
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.contacts import constraint_rows, constraints, frames, slips
+from wholearm_jax.contacts import constraint_rates, constraint_rows, constraints, frames, rates, slips
 from wholearm_jax.elimination import inverse, times
 from wholearm_jax.lookup import pick
 from wholearm_jax.precision import digits
@@ -29,8 +30,13 @@ CHARTS = 8  # directions that a wire may be charted by, one after the other
 
 
 def tangent(system: System, z: Float[Array, "5"], hint: Float[Array, "5"]) -> Float[Array, "5"]:
-    """Unit null vector of `G` with a positive component along `hint`."""
-    return oriented_tangent(system, z, hint)[0]
+    """Unit null vector of `G` with a positive component along `hint`; carries first derivatives."""
+    fixed, here, along = stop_gradient((system, z, hint))
+    inverted, _ = inverse(jnp.concatenate([constraint_rows(fixed.contacts, here), along[None]]))
+    x = inverted[:, 4]
+    left = jnp.append(constraint_rates(system.contacts, z, x), hint @ x - 1.0)  # of G x = 0, hint . x = 1
+    x = x - times(inverted, left)
+    return x / jnp.sqrt((x**2).sum())
 
 
 def oriented_tangent(system: System, z, hint):
@@ -54,17 +60,8 @@ def signs_of(values, tolerance):
     return jnp.where(jnp.abs(values) > tolerance, jnp.sign(values), 0.0)
 
 
-def watched_at(system: System, heading: Heading, z):
-    """Values that must stay positive along the wire, and how far along its feature each candidate contact lies."""
-    pairs, held = frames(system.candidates, z), frames(system.contacts, z)
-    sense = jnp.where(heading.until_coordinate < 0, 0.0, 1.0)
-    ahead = (heading.until_value - z[heading.until_coordinate]) * sense + (1 - sense)
-    room = [held.along - system.contacts.lower, system.contacts.upper - held.along]
-    return jnp.concatenate([pairs.gap, *room, ahead[None]]), pairs.along
-
-
 class Watched(NamedTuple):
-    """Values that stay positive on a wire (`watched_at`), their rates `d/ds`, and places along candidate features."""
+    """Values that stay positive on a wire (`_watch`), their rates `d/ds`, and places along candidate features."""
 
     values: Float[Array, "watch"]
     rates: Float[Array, "watch"]
@@ -77,7 +74,7 @@ class March(NamedTuple):
     `orientation` is `det [G; x]` at each; `flips` says what reverses or turns on the way to it from the node before
     (`speeds_of`, then the chart), at what `share` of that way. `speeds` are those of the last node, `sense` the signs
     that they had last. `before` is what is watched at the last node within the wire, `beyond` at the last one tried.
-    `end` is the row of `watched_at` that ends the wire (-1: none), about at `end_z`.
+    `end` is the row of `before` that ends the wire (-1: none), about at `end_z`.
     """
 
     n: Int[Array, ""]
@@ -118,13 +115,19 @@ def march(system: System, heading: Heading, z: Float[Array, "5"], x: Float[Array
 
 def _watch(system, heading, sense, z, x, u) -> Watched:
     """What is watched at a place of the wire, and its rates in the chart with direction `u`."""
-
-    def signed(z):
-        values, along = watched_at(system, heading, z)
-        return values.at[-1].multiply(sense), along
-
-    (values, along), (rates, _) = jax.jvp(signed, (z,), (x / (u @ x),))
-    return Watched(values, rates, along)
+    pairs, held = frames(system.candidates, z), frames(system.contacts, z)
+    slope = x / (u @ x)
+    opens, _ = rates(system.candidates, z, slope)
+    _, along = rates(system.contacts, z, slope)
+    coordinate = heading.until_coordinate
+    ahead = jnp.where(coordinate < 0, 1.0, (heading.until_value - z[coordinate]) * sense)
+    nears = jnp.where(coordinate < 0, 0.0, -slope[coordinate] * sense)
+    room = [held.along - system.contacts.lower, system.contacts.upper - held.along]
+    return Watched(
+        values=jnp.concatenate([pairs.gap, *room, ahead[None]]),
+        rates=jnp.concatenate([opens, along, -along, nears[None]]),
+        along=pairs.along,
+    )
 
 
 def _begin(system, z, x, watched, tolerance, capacity) -> March:
@@ -267,17 +270,23 @@ def crossings(system, before: Watched, after: Watched, step, tolerance):
     turns = (before.rates < 0) & (after.rates > 0) & (old > tolerance)
     sinks = turns & (old - step * before.rates**2 / (2 * slope) < 0)
     dips = sinks & (new > tolerance)
-    line = jnp.clip(old / jnp.where(through, old - new, 1.0), 0.0, 1.0)
-    bend = jnp.sqrt(jnp.where(sinks, before.rates**2 - 2 * old * slope / step, 0.0))
-    where = jnp.where(through & ~sinks, line, (-before.rates - bend) / slope)  # what comes back is met on its way down
-    low, high = step * before.rates, step * after.rates
-    square, cube = 3 * (new - old) - 2 * low - high, low + high - 2 * (new - old)
-    for _ in range(2):
-        rate = low + where * (2 * square + 3 * where * cube)
-        better = where - (old + where * (low + where * (square + where * cube))) / jnp.where(rate < 0, rate, -1.0)
-        where = jnp.where((rate < 0) & (better >= 0) & (better <= 1), better, where)
-    pairs = system.candidates.lower.shape[0]
-    at = before.along + (after.along - before.along) * where[:pairs]
-    inside = (at >= system.candidates.lower - tolerance) & (at <= system.candidates.upper + tolerance)
-    counts = jnp.concatenate([inside & system.watched, jnp.ones(new.shape[0] - pairs, bool)])
-    return (through | dips) & counts, where
+
+    def placed():
+        """Most steps cross nothing: there all this is left out."""
+        line = jnp.clip(old / jnp.where(through, old - new, 1.0), 0.0, 1.0)
+        bend = jnp.sqrt(jnp.where(sinks, before.rates**2 - 2 * old * slope / step, 0.0))
+        # What comes back is met on its way down.
+        where = jnp.where(through & ~sinks, line, (-before.rates - bend) / slope)
+        low, high = step * before.rates, step * after.rates
+        square, cube = 3 * (new - old) - 2 * low - high, low + high - 2 * (new - old)
+        for _ in range(2):
+            rate = low + where * (2 * square + 3 * where * cube)
+            better = where - (old + where * (low + where * (square + where * cube))) / jnp.where(rate < 0, rate, -1.0)
+            where = jnp.where((rate < 0) & (better >= 0) & (better <= 1), better, where)
+        pairs = system.candidates.lower.shape[0]
+        at = before.along + (after.along - before.along) * where[:pairs]
+        inside = (at >= system.candidates.lower - tolerance) & (at <= system.candidates.upper + tolerance)
+        counts = jnp.concatenate([inside & system.watched, jnp.ones(new.shape[0] - pairs, bool)])
+        return (through | dips) & counts, where
+
+    return jax.lax.cond(jnp.any(through | dips), placed, lambda: (through & dips, jnp.zeros_like(old)))

@@ -1,0 +1,88 @@
+"""Closed forms of contacts against automatic derivatives, for all that may meet, in contact and apart."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.contacts import (
+    constraint_curvature,
+    constraint_rates,
+    constraint_rows,
+    constraints,
+    frames,
+    rates,
+    slip_rows,
+    slips,
+)
+from wholearm_jax.march import oriented_tangent, tangent
+from wholearm_jax.scene import body
+from wholearm_jax.system import system
+
+NEAR = {"rtol": 1e-13, "atol": 1e-13}
+
+
+@pytest.fixture(scope="module", params=["heptagon", "tipping"])
+def mechanics(request):
+    """A formation that slides, and one with a contact that rolls; its candidates are all groups of features."""
+    scene = wa.load(request.param)
+    return system(body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)
+
+
+def anywhere(seed):
+    """A configuration, of which nothing need touch, and a direction."""
+    return jnp.asarray(np.random.default_rng(seed).normal(size=(2, 5)))
+
+
+@pytest.mark.parametrize("angle", [np.pi, -np.pi, np.nextafter(np.pi, 4), 1e-9, 0.0, np.pi / 2])
+def test_a_body_turns_by_its_angle(mechanics, angle):
+    """Also where the tangent of half the angle is infinite but for rounding."""
+    z = jnp.asarray([0.1, 0.2, angle, angle, angle])
+    vertex = mechanics.candidates.point
+    turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ np.asarray(vertex).T
+    on = np.asarray(mechanics.candidates.on_link)
+    np.testing.assert_allclose(frames(mechanics.candidates, z).from_object[on], turned.T[on], atol=1e-15)
+    slope = jax.jacfwd(lambda z: frames(mechanics.candidates, z).from_object)(z)[on, :, 2]
+    np.testing.assert_allclose(slope, np.stack([-turned[1], turned[0]], axis=1)[on], atol=1e-15)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_rates_are_derivatives_of_gaps_and_places(mechanics, seed):
+    z, x = anywhere(seed)
+    for several in (mechanics.contacts, mechanics.candidates):
+        _, (gap, along) = jax.jvp(lambda z, s=several: (frames(s, z).gap, frames(s, z).along), (z,), (x,))
+        opens, moves = rates(several, z, x)
+        np.testing.assert_allclose(opens, gap, **NEAR)
+        np.testing.assert_allclose(moves, along, **NEAR)
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_what_leaves_out_the_rows_is_their_product(mechanics, seed):
+    z, x = anywhere(seed)
+    several = mechanics.contacts
+    np.testing.assert_allclose(constraint_rates(several, z, x), constraint_rows(several, z) @ x, **NEAR)
+    np.testing.assert_allclose(slips(several, z, x), several.slides * (slip_rows(several, z) @ x), **NEAR)
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_curvature_of_all_that_may_meet(mechanics, seed):
+    z, x = anywhere(seed)
+    for several in (mechanics.contacts, mechanics.candidates):
+
+        def slope(z, several=several):
+            return jax.jvp(lambda z: constraints(several, z), (z,), (x,))[1]
+
+        _, curvature = jax.jvp(slope, (z,), (x,))
+        np.testing.assert_allclose(constraint_curvature(several, z, x), curvature, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_the_tangent_and_its_derivatives(mechanics, mode):
+    """Against the null vector by elimination, derived through the elimination."""
+    z, hint = anywhere(6)
+    np.testing.assert_allclose(tangent(mechanics, z, hint), oriented_tangent(mechanics, z, hint)[0], **NEAR)
+    for argument in (0, 1):
+        found = mode(lambda z, hint: tangent(mechanics, z, hint), argument)(z, hint)
+        known = mode(lambda z, hint: oriented_tangent(mechanics, z, hint)[0], argument)(z, hint)
+        np.testing.assert_allclose(found, known, rtol=1e-11, atol=1e-11)
