@@ -10,7 +10,7 @@ from jax.lax import stop_gradient
 
 from wholearm_jax.precision import digits
 from wholearm_jax.reduction import Table, on_panel, powers
-from wholearm_jax.schedule import Window, interval, torque_in
+from wholearm_jax.schedule import Window, torque_in
 from wholearm_jax.stepping import Integration, solver_of
 
 LANDINGS = 40  # at most so many Newton steps, or halvings, to the place where a stage ends
@@ -39,14 +39,13 @@ def single_step(table, seen, duration, how: Integration, piece, row, share, y, l
     return solver.step(term, share, share + length, y, args, state, made_jump=True)[0]
 
 
-def land(table, seen, duration, how, piece, node, end, goal, floor, wanted):
+def land(table, seen, duration, how, piece, row, node, end, goal, floor, wanted):
     """Retake the last step from `node` with the length that lands on `s = goal` or on `w = 0`, whichever comes first.
 
     Returns where it lands, whether on the goal, and whether it went astray: no length within the step lands there.
     """
     share, s, w = node
     longest = jnp.where(wanted, end - share, 0.0)
-    row = interval(seen, stop_gradient(share + longest / 2))
 
     def field(share, y, args):
         table, seen, duration = args

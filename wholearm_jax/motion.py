@@ -62,6 +62,7 @@ class _State(NamedTuple):
     nodes: Float[Array, "nodes 3"]
     entry_w: Float[Array, "steps"]
     pieces: Int[Array, "steps"]
+    rows: Int[Array, "steps"]
     held: Bool[Array, "steps"]
 
 
@@ -96,6 +97,7 @@ def move(
         nodes=jnp.broadcast_to(first, (capacity + 1, 3)),
         entry_w=jnp.zeros(capacity, dtype),
         pieces=jnp.zeros(capacity, int),
+        rows=jnp.broadcast_to(seen.first.astype(int), capacity),
         held=jnp.zeros(capacity, bool),
     )
     free = jnp.asarray(free)
@@ -113,14 +115,13 @@ def move(
         state, _ = jax.lax.scan(once, state, None, length=how.stages)
     beyond = jnp.arange(capacity + 1) > state.count
     nodes = jnp.where(beyond[:, None], state.nodes[state.count], state.nodes)
-    middle = (nodes[:-1, 0] + nodes[1:, 0]) / 2
     return Motion(
         share=nodes[:, 0],
         s=nodes[:, 1],
         w=nodes[:, 2],
         entry_w=state.entry_w,
         piece=state.pieces,
-        row=jax.vmap(lambda m: interval(seen, m))(stop_gradient(middle)),
+        row=state.rows,
         held=state.held,
         count=state.count,
         status=state.status.astype(int),
@@ -148,11 +149,13 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
 
     steps = _integrate(table, seen, duration, how, state, final, goal, floor)
     overshot = steps.passed
-    state, complete, last_time = _recorded(state, steps, overshot, room)
+    last_step = jnp.maximum(steps.count - 1, 0)
+    last_time, row = jnp.where(overshot, pick(steps.end, last_step), 1.0), pick(steps.row, last_step)
+    state, complete = _recorded(state, steps, overshot, room)
     node = state.share, state.s, state.w
-    landed = land(table, seen, duration, how, state.piece, node, last_time, goal, floor, overshot)
+    landed = land(table, seen, duration, how, state.piece, row, node, last_time, goal, floor, overshot)
     land_share, land_s, land_w, passed, astray = landed
-    state = _append(state, overshot, land_share, land_s, land_w, state.w, held=False)
+    state = _append(state, overshot, land_share, land_s, land_w, state.w, row, held=False)
     onward = passed & ~last
     factor = table.factor[jnp.minimum(state.piece + 1, table.factor.shape[0] - 1)]
     # `done` waits for the next stage where the object has come to rest: it may start again.
@@ -183,13 +186,13 @@ def _wait(table, seen, how, free, state: _State):
     verdict = jnp.where(rest, verdict, int(Status.OK))
     waited = rest & (share > state.share)
     room = how.max_steps - state.count - waited
-    state = _append(state, waited, share, state.s, state.w, state.w, held=True)
+    row = interval(seen, stop_gradient(state.share + share) / 2)
+    state = _append(state, waited, share, state.s, state.w, state.w, row, held=True)
     return state._replace(share=share), verdict, room
 
 
 def _recorded(state: _State, steps: Steps, overshot, room):
-    """Record steps but the last one where it `overshot`: the state after them, whether the record holds them all, and
-    when the one that overshoots ends."""
+    """Record steps but the last one where it `overshot`: the state after them, whether the record holds them."""
     capacity = state.entry_w.shape[0]
     y0 = jnp.stack([state.s, state.w])
     # The record is as long as one stage may be; several stages together may need more.
@@ -209,9 +212,10 @@ def _recorded(state: _State, steps: Steps, overshot, room):
         nodes=nodes,
         entry_w=state.entry_w.at[place - 1].set(entered, mode="drop"),
         pieces=state.pieces.at[place - 1].set(state.piece, mode="drop"),
+        rows=state.rows.at[place - 1].set(steps.row, mode="drop"),
         count=start + kept,
     )
-    return state, complete, jnp.where(overshot, pick(steps.end, jnp.maximum(steps.count - 1, 0)), 1.0)
+    return state, complete
 
 
 def _integrate(table, seen, duration, how, state, final, goal, floor) -> Steps:
@@ -236,7 +240,7 @@ def _integrate(table, seen, duration, how, state, final, goal, floor) -> Steps:
     return steps if how.adjoint == "none" else solve(repeated, inputs, steps)
 
 
-def _append(state, wanted, share, s, w, entry_w, *, held):
+def _append(state, wanted, share, s, w, entry_w, row, *, held):
     """Add one step to the record where `wanted`."""
     capacity = state.entry_w.shape[0]
     place = jnp.where(wanted & (state.count < capacity), state.count + 1, capacity + 1)
@@ -244,6 +248,7 @@ def _append(state, wanted, share, s, w, entry_w, *, held):
         nodes=state.nodes.at[place].set(jnp.stack([share, s, w]), mode="drop"),
         entry_w=state.entry_w.at[place - 1].set(entry_w, mode="drop"),
         pieces=state.pieces.at[place - 1].set(state.piece, mode="drop"),
+        rows=state.rows.at[place - 1].set(row, mode="drop"),
         held=state.held.at[place - 1].set(held, mode="drop"),
         count=state.count + (place <= capacity),
     )
