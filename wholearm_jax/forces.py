@@ -30,6 +30,7 @@ from wholearm_jax.stepping import Integration
 SAMPLES = 7  # places in a step at which forces are sampled before the minimum is refined
 MOST_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
 REFINED = 4  # dips refined: those that parabolas through samples put lowest
+FEW = 16  # steps sampled together
 GOLDEN = 14  # sections to a dip: Newton's step on the true motion follows
 
 
@@ -160,29 +161,63 @@ def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion
     is as accurate as the integration.
     """
     steps = arcs(table, seen, duration, motion)
-    values = stop_gradient(sampled_slacks(table, seen, duration, steps))
-    _, lowest = jax.lax.top_k(-_dips(values).ravel(), REFINED)
+    values = _values(*stop_gradient((table, seen, duration, steps)), motion.count)
 
-    def refine(flat):
-        step, contact = flat // values.shape[2], flat % values.shape[2]
+    def at(number):
+        """What a dip in a step depends on, and its place as (step, contact)."""
+        step, contact = number // values.shape[2], number % values.shape[2]
         arc = jax.tree.map(lambda a: pick(a, step), steps)
-        seat, reach = jnp.argmin(pick(pick(values, step).T, contact)) / (SAMPLES - 1), 1.0 / (SAMPLES - 1)
-        inputs = table, seen, duration, arc, pick(motion.entry_w, step)
-        fixed = stop_gradient(inputs)
-        xi = _minimise(lambda xi: pick(slacks_on(*fixed[:4], xi), contact), seat, reach)
-        _, curve, shift, *_ = _dip(*fixed, how, contact, xi)
-        low, high = jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0)
-        xi = stop_gradient(jnp.clip(xi + shift, low, high))
-        here, curve, shift, slope, share, s = _dip(*inputs, how, contact, xi)
-        # To second order the least value, whose derivative is that at the true minimum.
-        shift = stop_gradient((jnp.clip(xi + shift, low, high) - xi) * (arc.share[1] - arc.share[0]))
-        here = here + slope * shift + stop_gradient(curve) * shift**2 / 2
-        return jnp.where(arc.live & ~arc.held, here, jnp.inf), share, s, contact
+        return (table, seen, duration, arc, pick(motion.entry_w, step)), step, contact
 
-    margin, share, s, contact = jax.vmap(refine)(lowest)
-    best = jnp.argmin(stop_gradient(margin))
+    def find(number):
+        """Where a dip is lowest, and about how low it goes there: exact to second order, without derivatives."""
+        inputs, step, contact = stop_gradient(at(number))
+        arc, width = inputs[3], inputs[3].share[1] - inputs[3].share[0]
+        seat, reach = jnp.argmin(pick(pick(values, step).T, contact)) / (SAMPLES - 1), 1.0 / (SAMPLES - 1)
+        xi = _minimise(lambda xi: pick(slacks_on(*inputs[:4], xi), contact), seat, reach)
+        here, curve, shift, slope, *_ = _dip(*inputs, how, contact, xi)
+        better = jnp.clip(xi + shift, jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0))
+        moved = (better - xi) * width
+        least = here + slope * moved + curve * moved**2 / 2
+        return jnp.where(arc.live & ~arc.held, least, jnp.inf), better
+
+    numbers = _lowest(_dips(values).ravel(), REFINED)
+    least, places = stop_gradient(jax.vmap(find)(numbers))
+    best = jnp.argmin(least)
+    inputs, _, contact = at(pick(numbers, best))
+    xi, arc = stop_gradient(pick(places, best)), inputs[3]
+    margin, curve, shift, slope, share, s = _dip(*inputs, how, contact, xi)
+    # To second order the least value, whose derivative is that at the true minimum.
+    shift = stop_gradient((jnp.clip(xi + shift, 0.0, 1.0) - xi) * (arc.share[1] - arc.share[0]))
+    margin = margin + slope * shift + stop_gradient(curve) * shift**2 / 2
+    margin = jnp.where(arc.live & ~arc.held, margin, jnp.inf)
     lost, lost_contact = _first_loss(*stop_gradient((table, seen, duration, steps)), values)
-    return Score(margin[best], share[best], s[best], contact[best], lost, lost_contact)
+    return Score(margin, share, s, contact, lost, lost_contact)
+
+
+def _values(table, seen, duration, steps: Arcs, count) -> Float[Array, "steps samples rows"]:
+    """`sampled_slacks` of the first `count` steps, few at a time: there is room for many more."""
+    rows = steps.live.shape[0]
+    few = min(FEW, rows)
+
+    def sample(k, values):
+        first = jnp.minimum(k * few, rows - few)
+        block = jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, first, few), steps)
+        fresh = sampled_slacks(table, seen, duration, block)
+        return jax.lax.dynamic_update_slice_in_dim(values, fresh, first, 0)
+
+    none = jnp.full((rows, SAMPLES, table.tangential.shape[0]), jnp.inf, steps.quintic.dtype)
+    return jax.lax.fori_loop(0, (count + few - 1) // few, sample, none)
+
+
+def _lowest(values: Float[Array, "n"], count: int) -> Int[Array, "count"]:
+    """The numbers of the lowest values, one after the other: sorting them all takes longer."""
+
+    def take(values, _):
+        lowest = jnp.argmin(values)
+        return values.at[lowest].set(jnp.inf), lowest
+
+    return jax.lax.scan(take, stop_gradient(values), length=count)[1]
 
 
 def smooth_margin(values, weights, temperature: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -242,9 +277,15 @@ def _dip(table, seen, duration, arc, entry_w, how, contact, xi):
     bend = acceleration(table, seen, duration, arc.piece, arc.row, share, s, w)
     value, slope = jax.jvp(at, (share, s, w), (jnp.ones_like(share), w, bend))
     wide = jnp.where(width > 0, width, 1.0)
-    curve = jax.grad(jax.grad(lambda xi: pick(slacks_on(table, seen, duration, arc, xi), contact)))(xi) / wide**2
+    curve = _second(lambda xi: pick(slacks_on(table, seen, duration, arc, xi), contact), xi) / wide**2
     inner = (xi > 0) & (xi < 1) & (curve > 0)
     return value, curve, jnp.where(inner, -slope / jnp.where(inner, curve, 1.0) / wide, 0.0), slope, share, s
+
+
+def _second(function, x):
+    """The second derivative."""
+    along = jnp.ones_like(x)
+    return jax.jvp(lambda x: jax.jvp(function, (x,), (along,))[1], (x,), (along,))[1]
 
 
 def _minimise(function, seat, reach):
