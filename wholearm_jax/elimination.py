@@ -51,10 +51,10 @@ def _rate(primals, tangents):
 
 
 def times(matrix: Float[Array, "m n"], right: Float[Array, "n *columns"]) -> Float[Array, "m *columns"]:
-    """The product with a vector or matrix as a sum of products: small batched ones are slow as calls of a library."""
+    """The product with a vector, as a sum of products, which is fused with what is about it, or with a matrix."""
     if right.ndim == 1:
         return (matrix * right).sum(1)
-    return (matrix[:, :, None] * right).sum(1)
+    return jnp.matmul(matrix, right, precision="highest")
 
 
 def solve(matrix: Float[Array, "n n"], right: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
