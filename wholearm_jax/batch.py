@@ -1,10 +1,11 @@
 """Check: one torque schedule against very many scenes, each traced, reduced, simulated, scored and judged.
 
-The plan of one scene is a scan over its phases; `jax.vmap` makes it a block of scenes, and where there are several
-devices `shard_map` gives each its own block, with loops of its own. A chunk is a number of blocks. The first pass is
-coarse (`QUICK`): few panels, fewer steps. It knows its error; scenes for which that is too large, or which ran out of
-steps, are packed together and done again at full resolution (`FULL`), and what is left then alone, by `plan.simulate`.
-So neither the slowest scene nor one that cannot be followed holds up the others or touches their results.
+The plan of one scene is a scan over its phases. A CPU does a block of scenes one after the other, each with loops that
+do what it needs and no more, a GPU side by side (`jax.vmap`); where there are several devices `shard_map` gives each
+its own block. A chunk is a number of blocks. The first pass is coarse (`QUICK`): few panels, fewer steps. It knows its
+error; scenes for which that is too large, or which ran out of steps, are packed together and done again at full
+resolution (`FULL`), and what is left then alone, by `plan.simulate`. So neither the slowest scene nor one that cannot
+be followed holds up the others or touches their results.
 """
 
 from collections.abc import Iterator, Sequence
@@ -215,14 +216,23 @@ def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):
 def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Level, mesh: Mesh):
     """Check `BLOCK` scenes a device."""
     if mesh.size == 1:
-        return _check_here(source, numbers, schedule, arrival, level)
+        return _check_here(source, numbers, schedule, arrival, level, _beside(mesh))
     return _check_apart(source, numbers, schedule, arrival, level, mesh)
 
 
+def _beside(mesh: Mesh) -> bool:
+    """Whether a device of a mesh should work on scenes side by side."""
+    return mesh.devices.flat[0].platform != "cpu"
+
+
 @Program
-def _check_here(source: Source, numbers, schedule: Torque, arrival, level: Level):
-    """Check scenes on one device."""
-    return jax.vmap(lambda n: check_scene(source.draw(n), schedule, arrival, level))(numbers)
+def _check_here(source: Source, numbers, schedule: Torque, arrival, level: Level, beside: bool = False):
+    """Check scenes on one device, one after the other or side by side."""
+
+    def one(number):
+        return check_scene(source.draw(number), schedule, arrival, level)
+
+    return jax.vmap(one)(numbers) if beside else jax.lax.map(one, numbers)
 
 
 @eqx.filter_jit
@@ -231,7 +241,7 @@ def _check_apart(source: Source, numbers, schedule: Torque, arrival, level: Leve
     arrays, static = eqx.partition(source, eqx.is_array)
 
     def local(arrays, numbers, schedule, arrival):
-        return _check_here.plain(eqx.combine(arrays, static), numbers, schedule, arrival, level)
+        return _check_here.plain(eqx.combine(arrays, static), numbers, schedule, arrival, level, _beside(mesh))
 
     each, whole = PartitionSpec("scenes"), PartitionSpec()
     mapped = jax.shard_map(local, mesh=mesh, in_specs=(whole, each, whole, whole), out_specs=each, check_vma=False)
