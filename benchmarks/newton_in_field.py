@@ -107,6 +107,12 @@ def move(way: Direct, seen: Window, duration, solver: dfx.AbstractSolver, tolera
 
 
 @eqx.filter_jit
+def moves(way: Direct, seen: Window, durations, solver: dfx.AbstractSolver, tolerance, max_steps: int) -> Path:
+    """One phase after the other, in one program."""
+    return jax.lax.map(lambda duration: move(way, seen, duration, solver, tolerance, max_steps), durations)
+
+
+@eqx.filter_jit
 def states(way: Direct, seen: Window, duration, path: Path):
     """`z` and `z_dot` (SI) and `c_n` [N] at every step of a path."""
 

@@ -10,9 +10,9 @@ object comes to rest, and times within `APART` of a slip reversal, where forces 
 
 Every time is that of one phase, warm, taken in turn. The package is timed as `move` alone, called from Python and, as
 a share of `MANY` phases that follow one another, within a program; as simulating and scoring (`run`); and with tracing
-and tabulating the wire included. All of JAX's programs, of both sides, are compiled as
-`wholearm_jax.configure` says, and again in a second process as XLA does by itself (`PLAIN`). For each error level the
-ratio is between the fastest runs that are at least as good.
+and tabulating the wire included. Newton's method, too, is timed called from Python and within a program. All of JAX's
+programs, of both sides, are compiled as `wholearm_jax.configure` says, and again in a second process as XLA does by
+itself (`PLAIN`). For each error level the ratio is between the fastest runs that are at least as good.
 """
 
 import argparse
@@ -59,7 +59,7 @@ PLAIN = (
 )
 """XLA's own choices, which `configure` then leaves."""
 
-MANY = 64  # phases of one program that share the cost of its call
+MANY, FEW = 64, 8  # phases of one program that share the cost of its call: the package's, and Newton's, which is small
 APART = 1e-4  # shares of the phase around a slip reversal that do not count
 STOP = {"knots": 0.999}  # the share up to which runs that come to rest are compared
 LEVELS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
@@ -75,6 +75,7 @@ SHOWN = {
     "package, trace and run": ("trace, simulate and score", "#009E73", "D"),
     "plain": ("move, XLA by itself", "#000000", "v"),
     "Newton in the field": ("Newton in the vector field", "#D55E00", "^"),
+    "Newton, within a program": ("the same, within a program", "#8C3B00", "<"),
     "un-reduced DOP853": ("SciPy, un-reduced", "#CC79A7", "P"),
     "bare loop": ("bare loop (numba)", "#999999", "x"),
 }
@@ -166,6 +167,14 @@ def error(problem: Problem, shares, z, z_dot, cn) -> float:
 # --- contenders: each returns its error, its steps and calls to time -------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Call:
+    """What is timed, and how many phases it does."""
+
+    do: Callable[[], Any]
+    phases: int = 1
+
+
 @eqx.filter_jit
 def _move(table: Table, seen: Window, duration, how: wa.Integration) -> Motion:
     return move(table, seen, duration, how=how)
@@ -205,14 +214,19 @@ def package(problem: Problem, solver: str, tolerance: float):
         traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading)
         return run(traced.table, *here, how, "moving")
 
-    durations = problem.duration * (1 + 1e-12 * jnp.arange(MANY))
+    durations = _durations(problem, MANY)
     calls = {
-        "package": lambda: _move(table, problem.seen, problem.duration, how),
-        "package, within a program": lambda: _moves(table, problem.seen, durations, how),
-        "package, run": lambda: run(table, *here, how, "moving"),
-        "package, trace and run": again,
+        "package": Call(lambda: _move(table, problem.seen, problem.duration, how)),
+        "package, within a program": Call(lambda: _moves(table, problem.seen, durations, how), MANY),
+        "package, run": Call(lambda: run(table, *here, how, "moving")),
+        "package, trace and run": Call(again),
     }
     return error(problem, *rows), count, calls
+
+
+def _durations(problem: Problem, count: int):
+    """Of as many phases, which differ by less than counts, so that none can be left out."""
+    return problem.duration * (1 + 1e-12 * jnp.arange(count))
 
 
 def between(problem: Problem, tolerance: float) -> dict[str, float]:
@@ -241,8 +255,14 @@ def direct(problem: Problem, solver: str, tolerance: float):
     found = newton_in_field.states(way, problem.seen, problem.duration, path)
     live = np.arange(limit) < np.asarray(path.count)[:, None]
     rows = (np.asarray(a)[live] for a in (path.steps[..., 0], *found))
-    call = lambda: newton_in_field.move(way, problem.seen, problem.duration, *rest, limit)  # noqa: E731
-    return error(problem, *rows), int(path.count.sum()), {"Newton in the field": call}
+    durations = _durations(problem, FEW)
+    calls = {
+        "Newton in the field": Call(lambda: newton_in_field.move(way, problem.seen, problem.duration, *rest, limit)),
+        "Newton, within a program": Call(
+            lambda: newton_in_field.moves(way, problem.seen, durations, *rest, limit), FEW
+        ),
+    }
+    return error(problem, *rows), int(path.count.sum()), calls
 
 
 def unreduced(problem: Problem, tolerance: float) -> dict:
@@ -264,8 +284,8 @@ def bare(problem: Problem, solver: str, tolerance: float):
     share, s, w = found.nodes[: found.count + 1].T
     there = _states(problem, jnp.asarray(share), jnp.asarray(s), jnp.asarray(w))
     nodes = np.empty((16385, 3))
-    call = {"bare loop": lambda: numba_loop.loop(given, float(problem.duration), method, tolerance, nodes)}
-    return error(problem, share, *(np.asarray(a) for a in there)), found.count, call
+    call = Call(lambda: numba_loop.loop(given, float(problem.duration), method, tolerance, nodes))
+    return error(problem, share, *(np.asarray(a) for a in there)), found.count, {"bare loop": call}
 
 
 def _states(problem: Problem, share, s, w):
@@ -290,9 +310,8 @@ def in_turn(problem: Problem, solver: str, tolerance: float, repeats: int) -> di
         wrong, steps, own = contender(problem, solver, tolerance)
         calls |= own
         rows |= {name: {"solver": solver, "tolerance": tolerance, "error": wrong, "steps": steps} for name in own}
-    times = measure.compare(calls, repeats=repeats)
-    times = {name: seconds / (MANY if "within" in name else 1) for name, seconds in times.items()}
-    return {name: row | {"seconds": times[name]} for name, row in rows.items()}
+    times = measure.compare({name: call.do for name, call in calls.items()}, repeats=repeats)
+    return {name: row | {"seconds": times[name] / calls[name].phases} for name, row in rows.items()}
 
 
 def everything(quick: bool, referred: bool) -> dict[str, dict[str, list[dict]]]:
@@ -414,12 +433,18 @@ def main() -> None:
                 row["error"] = known["error"]
         rows["un-reduced DOP853"] = found[problem]["un-reduced DOP853"]
     tables = {"configured": ratios(found, "package"), "XLA's own choices": ratios(plain, "package")}
+    within = ratios(found, "package, within a program")
     runs = {"configured": found, "XLA's own choices": plain}
-    path = measure.save("work_precision", {"levels": LEVELS, "flags": PLAIN, "ratios": tables, "runs": runs})
+    kept = {"levels": LEVELS, "flags": PLAIN, "ratios": tables, "within a program": within, "runs": runs}
+    path = measure.save("work_precision", kept)
     draw(found, plain, path.with_suffix(".svg"))
     for name, table in tables.items():
         print(f"\n{name.upper()}")
         tabulate(table, "package")
+    print("\nCONFIGURED, WITHIN A PROGRAM")
+    shown = ("bare loop", "Newton, within a program")
+    chosen = {problem: {name: rows[name] for name in shown} for problem, rows in within.items()}
+    tabulate(chosen, "package, within a program")
 
 
 if __name__ == "__main__":
