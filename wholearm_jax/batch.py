@@ -1,8 +1,8 @@
 """Check: one torque schedule against very many scenes, each traced, reduced, simulated, scored and judged.
 
 The plan of one scene is a scan over its phases. A CPU does a block of scenes one after the other, each with loops that
-do what it needs and no more, a GPU side by side (`jax.vmap`); where there are several devices `shard_map` gives each
-its own block. A chunk is a number of blocks. The first pass is coarse (`QUICK`): few panels, fewer steps. It knows its
+do what it needs and no more; a GPU does them side by side (`jax.vmap`), as does a CPU where all have the same wires,
+which are then traced once a block. Where there are several devices `shard_map` gives each its own block. A chunk is a number of blocks. The first pass is coarse (`QUICK`): few panels, fewer steps. It knows its
 error; scenes for which that is too large, or which ran out of steps, are packed together and done again at full
 resolution (`FULL`), and what is left then alone, by `plan.simulate`. So neither the slowest scene nor one that cannot
 be followed holds up the others or touches their results.
@@ -86,6 +86,11 @@ class Source(Protocol):
         """Its scene, or scenes, as far as all are alike in: phases, their names and how they arrive."""
         ...
 
+    @property
+    def same_wires(self) -> bool:
+        """Whether all scenes have the wires of one."""
+        ...
+
     def draw(self, number: Int[Array, ""]) -> Scene:
         """Scene number `number`."""
         ...
@@ -100,6 +105,11 @@ class Given(eqx.Module):
     def nominal(self) -> Scene:
         """The stacked scenes."""
         return self.scenes
+
+    @property
+    def same_wires(self) -> bool:
+        """Not that it is known."""
+        return False
 
     @property
     def count(self) -> int:
@@ -216,13 +226,13 @@ def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):
 def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Level, mesh: Mesh):
     """Check `BLOCK` scenes a device."""
     if mesh.size == 1:
-        return _check_here(source, numbers, schedule, arrival, level, _beside(mesh))
+        return _check_here(source, numbers, schedule, arrival, level, _beside(source, mesh))
     return _check_apart(source, numbers, schedule, arrival, level, mesh)
 
 
-def _beside(mesh: Mesh) -> bool:
+def _beside(source: Source, mesh: Mesh) -> bool:
     """Whether a device of a mesh should work on scenes side by side."""
-    return mesh.devices.flat[0].platform != "cpu"
+    return source.same_wires or mesh.devices.flat[0].platform != "cpu"
 
 
 @Program
@@ -241,7 +251,8 @@ def _check_apart(source: Source, numbers, schedule: Torque, arrival, level: Leve
     arrays, static = eqx.partition(source, eqx.is_array)
 
     def local(arrays, numbers, schedule, arrival):
-        return _check_here.plain(eqx.combine(arrays, static), numbers, schedule, arrival, level, _beside(mesh))
+        source = eqx.combine(arrays, static)
+        return _check_here.plain(source, numbers, schedule, arrival, level, _beside(source, mesh))
 
     each, whole = PartitionSpec("scenes"), PartitionSpec()
     mapped = jax.shard_map(local, mesh=mesh, in_specs=(whole, each, whole, whole), out_specs=each, check_vma=False)

@@ -45,6 +45,10 @@ QUANTITIES = {
 }
 
 
+GEOMETRY = frozenset({"vertices", "center_of_mass", "joint", "length", "offset", "start"})
+"""Those that wires depend on."""
+
+
 class Amount(NamedTuple):
     """Half the width of a uniform draw: a share of the value where `relative`, otherwise in the value's unit."""
 
@@ -63,6 +67,11 @@ class Ensemble(eqx.Module):
     def nominal(self) -> Scene:
         """The scene about which the others are drawn."""
         return self.scene
+
+    @property
+    def same_wires(self) -> bool:
+        """Whether all scenes have the wires of one."""
+        return GEOMETRY.isdisjoint(name for name, _ in self.amounts)
 
     @property
     def parameters(self) -> tuple[str, ...]:
