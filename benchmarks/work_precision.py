@@ -75,7 +75,7 @@ SHOWN = {
     "package, trace and run": ("trace, simulate and score", "#009E73", "D"),
     "plain": ("move, XLA by itself", "#000000", "v"),
     "Newton in the field": ("Newton in the vector field", "#D55E00", "^"),
-    "Newton, within a program": ("the same, within a program", "#8C3B00", "<"),
+    "Newton, within a program": ("Newton, within a program", "#8C3B00", "<"),
     "un-reduced DOP853": ("SciPy, un-reduced", "#CC79A7", "P"),
     "bare loop": ("bare loop (numba)", "#999999", "x"),
 }
@@ -361,7 +361,7 @@ def _ratio(rows: list[dict], against: list[dict], level: float) -> float | None:
 def draw(found: dict, plain: dict, path: Path) -> None:
     """Time against error, a panel for each problem."""
     plt.rcParams |= {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
-    figure, axes = plt.subplots(2, 2, figsize=(7.2, 5.6), sharex=True, sharey=True, layout="constrained")
+    figure, axes = plt.subplots(2, 2, figsize=(7.2, 5.8), sharex=True, sharey=True, layout="constrained")
     for ax, (problem, rows) in zip(axes.flat, found.items(), strict=True):
         for name, (label, colour, marker) in SHOWN.items():
             front = _front(plain[problem]["package"] if name == "plain" else rows[name])
@@ -374,7 +374,7 @@ def draw(found: dict, plain: dict, path: Path) -> None:
     for ax in axes[:, 0]:
         ax.set_ylabel("time of one phase [s]")
     axes[0, 0].invert_xaxis()
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
     figure.savefig(path)
     plt.close(figure)
 
