@@ -2,10 +2,11 @@
 
 The plan of one scene is a scan over its phases. A CPU does a block of scenes one after the other, each with loops that
 do what it needs and no more; a GPU does them side by side (`jax.vmap`), as does a CPU where all have the same wires,
-which are then traced once a block. Where there are several devices `shard_map` gives each its own block. A chunk is a number of blocks. The first pass is coarse (`QUICK`): few panels, fewer steps. It knows its
-error; scenes for which that is too large, or which ran out of steps, are packed together and done again at full
-resolution (`FULL`), and what is left then alone, by `plan.simulate`. So neither the slowest scene nor one that cannot
-be followed holds up the others or touches their results.
+which are then traced once a block. Where there are several devices `shard_map` gives each its own block. A chunk is a
+number of blocks. The first pass is coarse (`QUICK`): few panels, fewer steps. It knows its error; scenes for which that
+is too large, or which ran out of steps, are packed together and done again at full resolution (`FULL`), and what is
+left then alone, by `plan.simulate`. So neither the slowest scene nor one that cannot be followed holds up the others
+or touches their results.
 """
 
 from collections.abc import Iterator, Sequence
