@@ -219,7 +219,7 @@ def by_processes(torque: Path) -> dict:
 
 def draw(found: dict, path: Path) -> None:
     """Rates over the size of the batch, with lines for what has one rate."""
-    figure, ax = plt.subplots(figsize=(4.2, 3.0), layout="constrained")
+    figure, ax = plt.subplots(figsize=(4.2, 3.4), layout="constrained")
     rows = found["check"]["rows"]
     ax.loglog([r["count"] for r in rows], [r["rate"] for r in rows], "o-", color="#0072B2", label="check")
     lines = {
@@ -232,7 +232,7 @@ def draw(found: dict, path: Path) -> None:
         ax.axhline(part["rate"], color=colour, ls="--", lw=1.2, label=name)
     ax.set(xlabel="scenes", ylabel="plans a second")
     ax.spines[["top", "right"]].set_visible(False)
-    ax.legend(frameon=False, fontsize=8)
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False, fontsize=8)
     figure.savefig(path, bbox_inches="tight")
 
 
