@@ -237,7 +237,7 @@ def _beside(source: Source, mesh: Mesh) -> bool:
 
 
 @Program
-def _check_here(source: Source, numbers, schedule: Torque, arrival, level: Level, beside: bool = False):
+def _check_here(source: Source, numbers, schedule: Torque, arrival, level: Level, beside: bool):
     """Check scenes on one device, one after the other or side by side."""
 
     def one(number):

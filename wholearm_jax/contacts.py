@@ -235,20 +235,20 @@ def constraint_curvature(several: Contacts, z: Float[Array, "5"], x: Float[Array
     `-w^2 u.r + 2 w S u.r' + u.r''`, and `r''` points back to the centres that both points turn about.
     """
     at, on, (dx, dy), turn = frames(several, z), several.on_link, (x[0], x[1]), x[2]
-    swing = several.finger[:, 0] * x[3] + several.finger[:, 1] * x[4]
+    swing = _swing(several, x)
     (nx, ny), (ox, oy), (jx, jy) = ((a[:, 0], a[:, 1]) for a in (at.normal, at.from_object, at.from_joint))
     rx, ry = ny * at.along - nx * at.gap, -nx * at.along - ny * at.gap  # B: from the edge's start to the tip
     rx, ry = jnp.where(on, jx, rx), jnp.where(on, jy, ry)
     bx, by = jnp.where(on, ox, ox - rx), jnp.where(on, oy, oy - ry)  # the object's point, from its origin
-    rate = jnp.where(on, 1.0, -1.0)
+    sign = jnp.where(on, 1.0, -1.0)  # whose point is the far one: the object's, or the link's
     swept = jnp.where(on, 0.0, swing)
-    vx = rate * (dx - turn * by) - swept * jy
-    vy = rate * (dy + turn * bx) + swept * jx
-    ax = -rate * turn**2 * bx - swept**2 * jx
-    ay = -rate * turn**2 * by - swept**2 * jy
+    vx = sign * (dx - turn * by) - swept * jy
+    vy = sign * (dy + turn * bx) + swept * jx
+    ax = -sign * turn**2 * bx - swept**2 * jx
+    ay = -sign * turn**2 * by - swept**2 * jy
     w = jnp.where(on, swing, turn)
     ux, uy = jnp.where(several.tangential, ny, nx), jnp.where(several.tangential, -nx, ny)
-    return rate * (ux * ax + uy * ay - w**2 * (ux * rx + uy * ry) + 2 * w * (ux * vy - uy * vx))
+    return sign * (ux * ax + uy * ay - w**2 * (ux * rx + uy * ry) + 2 * w * (ux * vy - uy * vx))
 
 
 def _sense(several: Contacts) -> Float[Array, "slots"]:
@@ -270,8 +270,12 @@ def _velocity_rows(several: Contacts, at: Frame, direction: Float[Array, "slots 
 def _velocities(several: Contacts, at: Frame, direction: Float[Array, "slots 2"], x) -> Float[Array, "slots"]:
     """Those rows times `x`."""
     ux, uy, turn, arm = _moments(at, direction)
-    swing = several.finger[:, 0] * x[3] + several.finger[:, 1] * x[4]
-    return ux * x[0] + uy * x[1] + turn * x[2] + arm * swing
+    return ux * x[0] + uy * x[1] + turn * x[2] + arm * _swing(several, x)
+
+
+def _swing(several: Contacts, x: Float[Array, "5"]) -> Float[Array, "slots"]:
+    """How fast each contact's own link turns; the palm does not."""
+    return several.finger[:, 0] * x[3] + several.finger[:, 1] * x[4]
 
 
 def _moments(at: Frame, direction: Float[Array, "slots 2"]):

@@ -248,12 +248,12 @@ def _optimise_group(
         where = 100 * float(task.tops[weakest].share)
         why = f"no torque within limits holds this formation at {where:.0f} % of its wire"
         return _schedules(task, best), why, []
-    best_key, reason, history = (False, -np.inf), "", []
+    problem, best_key, reason, history = task.problem(limits), (False, -np.inf), "", []
     for number, start in enumerate(begins):
         if before is not None:
             limit = task.traced[0].table.torque_limit
             start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[0, 0].set(before / limit))
-        p, why, taken = descend(task.problem(limits), start, number, method, callback)
+        p, why, taken = descend(problem, start, number, method, callback)
         history += taken
         key = _honest(scene, task, p)
         agree = key[0] and best_key[0] and abs(key[1] - best_key[1]) <= task.tolerance
