@@ -9,6 +9,7 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax import plan
 from wholearm_jax.contacts import normal_rows, slip_rows
+from wholearm_jax.optimiser import PASSING
 from wholearm_jax.phase import start_configuration
 from wholearm_jax.reduction import change, on_panel, powers
 from wholearm_jax.scene import body
@@ -30,9 +31,9 @@ def test_three_formations_without_a_stop(flown):
     assert float(jnp.abs(flown.torque.values).max()) <= 1.0
     for before, after in zip(result.phases[:-1], result.phases[1:], strict=True):
         assert after.start == pytest.approx(before.time, abs=1e-12), "the change is when the formation ends"
-        assert float(jnp.abs(before.outcome.leaving).max()) > 1e-4, "moving"
+        mean = float(after.traced.table.length) / float(after.duration)
+        assert float(after.outcome.entered.speed) > (PASSING - 1e-6) * mean, "at speed"
         assert min(after.impulses) > 0
-    assert float(jnp.abs(result.phases[0].outcome.leaving).max()) > 0.5, "the first change at speed"
     for phase, top in zip(result.phases, flown.bounds, strict=True):
         assert 0 < phase.margin <= float(top.value) + 1e-9
 

@@ -87,6 +87,9 @@ def optimise(
     knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase.")] = 51,
     steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 160,
     rate_limit: Annotated[float | None, typer.Option(min=0.0, help="Largest torque rate [N m/s].")] = None,
+    passing: Annotated[
+        float | None, typer.Option(min=0.0, help="Least speed at changes of formation, over the mean speed (0.2).")
+    ] = None,
     samples: Annotated[
         int | None, typer.Option(min=2, help="Rows a phase in trajectory.csv (201), or samples.")
     ] = None,
@@ -103,14 +106,15 @@ def optimise(
     loaded = scene_of(scene, set_)
     folder = made_folder(out)
     if robust:
-        if rate_limit is not None:
-            raise BadInput("--robust: knows no --rate-limit")
+        unknown = [name for name, value in (("rate-limit", rate_limit), ("passing", passing)) if value is not None]
+        if unknown:
+            raise BadInput(f"--robust: knows no --{unknown[0]}")
         optimise_robustly(ensemble(loaded, robust, seed), folder, samples or 64, knots, steps, arrival)
     samples = samples or 201
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from wholearm_jax.optimiser import compile_ahead
+    from wholearm_jax.optimiser import PASSING, compile_ahead
     from wholearm_jax.optimiser import optimise as find
 
     begun = time.perf_counter()
@@ -125,7 +129,9 @@ def optimise(
             progress.update(bars[step.phase], completed=step.step + 1, state=state)
 
         progress.update(bars[0], state="compiling")
-        found = find(loaded, knots=knots, steps=steps, rate_limit=rate_limit, callback=show, traced=traced)
+        passing = PASSING if passing is None else passing
+        options = {"knots": knots, "steps": steps, "rate_limit": rate_limit, "passing": passing}
+        found = find(loaded, **options, callback=show, traced=traced)
         for bar, why in zip(bars, found.stopped, strict=True):
             progress.update(bar, completed=steps, state=why)
     seconds = time.perf_counter() - begun
@@ -133,7 +139,7 @@ def optimise(
         reached = f", {100 * share:.1f} % of it reached" if 0 < share < float("inf") else ""
         print(f"{phase.message}; bound {float(top.value):.4g} N{reached}; stopped: {why}")
     more = {"command": "optimise", "knots": knots, "steps": len(found.history), "seconds": seconds}
-    more |= {"rate_limit": rate_limit, "stopped": list(found.stopped)}
+    more |= {"rate_limit": rate_limit, "passing": passing, "stopped": list(found.stopped)}
     tops = tuple(float(b.value) for b in found.bounds)
     _finish(found.result, folder, samples, report=report, bounds=tops, **more)
 

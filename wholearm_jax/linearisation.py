@@ -19,12 +19,14 @@ from wholearm_jax.stepping import Integration
 
 
 class Limits(eqx.Module):
-    """What the result must respect: torque rates [N m/s], durations [s], which knots' torques stay as they are; and
-    each phase's `unit` of forces [N]."""
+    """What the result must respect: torque rates [N m/s], durations [s], the speed with which phases that do not begin
+    at rest are entered at the least (`passing`, in wire lengths a duration), which knots' torques stay as they are;
+    and each phase's `unit` of forces [N]."""
 
     rate: Float[Array, "2"]
     shortest: Float[Array, ""]
     longest: Float[Array, ""]
+    passing: Float[Array, ""]
     pinned: Bool[Array, "phases knots"]
     unit: Float[Array, "phases"]
 
@@ -52,8 +54,8 @@ class Linear(NamedTuple):
     still: Bool[Array, "p"]
 
 
-def rooms(q: Float[Array, "7"], later, unit, table: Table, limits: Limits, how, intervals: int) -> Rooms:
-    """One interval; `later` is 0 where it starts at rest, and 1 for all others."""
+def rooms(q: Float[Array, "7"], slowest, unit, table: Table, limits: Limits, how, intervals: int) -> Rooms:
+    """One interval; `slowest` is the least speed with which it may begin, and -inf where it starts at rest."""
     shot = shoot(table, how, intervals, q)
     torque, log = q[2:6], q[6]
     bounded = jnp.isfinite(limits.rate)
@@ -62,7 +64,9 @@ def rooms(q: Float[Array, "7"], later, unit, table: Table, limits: Limits, how, 
     span = jnp.log(limits.longest / limits.shortest)
     free = span > 0
     ends = jnp.stack([log - jnp.log(limits.shortest), jnp.log(limits.longest) - log]) / jnp.where(free, span, 1.0)
-    room = [(shot.forces / unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, shot.pace, ends]
+    later = slowest > -jnp.inf
+    pace = shot.pace.at[0].add(jnp.where(later, -slowest, 0.0))
+    room = [(shot.forces / unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, pace, ends]
     one = jnp.full((), 1 / intervals)
     sampled = (shot.weight[:, None] * ~spare(table)).ravel()
     climbs = jnp.tile(jnp.where(bounded, one / 4, 0.0), 2)
@@ -75,14 +79,13 @@ def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> 
     """Simulate all intervals, with first derivatives by forward mode."""
     phases, knots = p.torque.shape[:2]
 
-    def both(q, later, unit, table):
-        at = rooms(q, later, unit, table, limits, how, knots - 1)
+    def both(q, slowest, unit, table):
+        at = rooms(q, slowest, unit, table, limits, how, knots - 1)
         return at, at
 
     each = jax.vmap(jax.vmap(jax.jacfwd(both, has_aux=True), (0, 0, None, None)))
-    later = np.ones((phases, knots - 1))
-    later[0, 0] = 0.0
-    rates, at = each(local(p), later, limits.unit, tables)
+    slowest = jnp.zeros((phases, knots - 1)).at[:, 0].set(limits.passing).at[0, 0].set(-jnp.inf)
+    rates, at = each(local(p), slowest, limits.unit, tables)
     columns, ends = _columns(phases, knots)
     row = np.arange(ends.size)
     n = 4 * phases * knots + phases

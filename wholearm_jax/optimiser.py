@@ -36,6 +36,7 @@ from wholearm_jax.stepping import Integration
 from wholearm_jax.wire import Resolution
 
 TORQUE_SHARE = 0.9  # share of the torque limits that a start may use
+PASSING = 0.2  # least speed with which a phase is entered that does not begin at rest, over its mean speed
 GOOD = 0.99  # share of the bound with which no further start is tried
 
 
@@ -116,6 +117,7 @@ def optimise(
     steps: int = 160,
     rate_limit: float | None = None,
     durations: tuple[float, float] | None = None,
+    passing: float = PASSING,
     optimiser: optax.GradientTransformation | None = None,
     tolerance: float = 1e-3,
     callback: Callable[[Step], None] | None = None,
@@ -124,13 +126,14 @@ def optimise(
     """Find the torque schedule with the largest compressive margin by gradient descent through the simulation.
 
     Each phase must arrive at its planned end in time, at rest or, where the next takes over, `moving`; `knots` torques
-    a joint and phase, evenly spaced in time, are linear in between. The scene's
-    torque limits hold, and `rate_limit` [N m/s] if given. `durations = (shortest, longest)` lets each phase choose its
-    own. `optimiser` replaces the interior point by any optax optimiser (`descent.projected`). A phase stops when its
-    margin comes within `tolerance` of the bound or no longer improves by that share, or after `steps`. `callback` sees
-    every step; `traced` reuses the result of `trace`. A phase that holds the object keeps its duration and gets the
-    best torque of its statics, approached as fast as `rate_limit` allows. Where no torque can hold a formation,
-    nothing is searched and the status says so.
+    a joint and phase, evenly spaced in time, are linear in between. The scene's torque limits hold, and `rate_limit`
+    [N m/s] if given. `durations = (shortest, longest)` lets each phase choose its own. Formations that take over at
+    speed are entered with at least `passing` times their phase's mean speed (wire over duration): an object that hardly
+    moves where its formation changes may as well stop short of it. `optimiser` replaces the interior point by any optax
+    optimiser (`descent.projected`). A phase stops when its margin comes within `tolerance` of the bound or no longer
+    improves by that share, or after `steps`. `callback` sees every step; `traced` reuses the result of `trace`. A phase
+    that holds the object keeps its duration and gets the best torque of its statics, approached as fast as `rate_limit`
+    allows. Where no torque can hold a formation, nothing is searched and the status says so.
 
     Derivation, section 9. Raises RuntimeError without float64.
 
@@ -155,7 +158,7 @@ def optimise(
             continue
         own = [traced[k] for k in group], [tops[k] for k in group]
         task = _Task(group[0], parts, *own, knots, rows, steps, tolerance)
-        limits = _limits(task, rate_limit, durations, before)
+        limits = _limits(task, rate_limit, durations, passing, before)
         method = _method(optimiser, len(group))
         schedules, why, taken = _optimise_group(scene, task, limits, before, method, callback)
         found += schedules
@@ -277,7 +280,7 @@ def _compile(phases: int, knots: int, rows: int, method) -> None:
     """Run the descent's programs once, on blank tables."""
     table = blank(Resolution())
     tables = _stacked([table] * phases)
-    plain = (np.full(2, np.inf), _ONE, _ONE, np.zeros((phases, knots), bool), np.ones(phases))
+    plain = (np.full(2, np.inf), _ONE, _ONE, 0 * _ONE, np.zeros((phases, knots), bool), np.ones(phases))
     limits = Limits(*(array(a) for a in plain))
     empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
     p = Variables(*(array(a) for a in empty))
@@ -336,11 +339,11 @@ def _in_turn(schedules: list[Torque]) -> Torque:
 _bound = Program(bound)
 
 
-def _limits(task: _Task, rate_limit, durations, before) -> Limits:
+def _limits(task: _Task, rate_limit, durations, passing, before) -> Limits:
     lengths = task.durations
     shortest, longest = durations or (lengths.min(), lengths.min())
     rate = np.full(2, np.inf if rate_limit is None else float(rate_limit))
     pinned = np.zeros((len(lengths), task.knots), bool)
     pinned[0, 0] = before is not None
     unit = np.maximum(task.bounds, 1e-300)
-    return Limits(*(array(a) for a in (rate, shortest * _ONE, longest * _ONE, pinned, unit)))
+    return Limits(*(array(a) for a in (rate, shortest * _ONE, longest * _ONE, passing * _ONE, pinned, unit)))

@@ -221,7 +221,8 @@ def _reached(row) -> str:
 def _settings(summary: dict[str, Any]) -> dict[str, str]:
     """How the result was made: all that the summary says beside the result itself."""
     known = {"status", "margin", "message", "phases", "scene", "stopped"}
-    named = {"seconds": "time taken [s]", "rate_limit": "largest torque rate [N m/s]", "steps": "steps of descent"}
+    named = {"seconds": "time taken [s]", "steps": "steps of descent", "rate_limit": "largest torque rate [N m/s]"}
+    named |= {"passing": "least speed at changes, over the mean"}
     return {str(named.get(k, k)): _digits(v) for k, v in summary.items() if k not in known and v is not None}
 
 
