@@ -56,8 +56,9 @@ from wholearm_jax.status import Status
 KNOTS, TIMESTEP = 51, 5e-5  # [s]
 TOLERANCE = Tolerance()
 FREE = 5e-3  # [s] for which a lost contact is tensile, or open; shorter is chatter of the contact's softness
-OPEN = 1e-5  # [m] gap above which an executed contact is open
+OPEN = 2e-6  # [m] gap above which an executed contact is open
 MARGIN_OF_TIME = 0.02  # [s] at either end of a phase, while formations change, in which forces are not judged
+PASSED = 0.02  # distance from its wire's end, over the tolerance, within which a phase that passes on has reached it
 HURRY, EARLY = 0.1, 0.05  # speed over the mean speed, and share of the phase left, with which a wire's end is too early
 SLOW = 0.02  # speed over the mean speed below which an object counts as at rest
 PAUSE = 0.1  # [s] for which a pausing plan holds the object
@@ -186,7 +187,8 @@ def _course(result, phase):
 def _arrives(phase, course) -> bool | None:
     """Whether a phase ends where it should; None where its plan does not say what follows.
 
-    That is so where it comes to its end too early, or where it should have passed on at speed and is merely late.
+    That is so where it comes to its end too early, or where it should have passed on at speed and is late, or stops
+    just short: the model begins the next phase where its wire begins, and the object is not there yet.
     """
     motion = phase.outcome.motion
     ended, length = Status(int(motion.status)), float(phase.traced.table.length)
@@ -197,7 +199,7 @@ def _arrives(phase, course) -> bool | None:
     if _rests(phase):
         return there and phase.status in (Status.OK, Status.CONTACT_LOST)
     if phase.arrive == "moving":
-        return None if ended is Status.OK and not there else there
+        return True if _off(phase, course) <= PASSED else None if there or ended is Status.OK else False
     if there and (pace > HURRY or share < 1 - EARLY):
         return None
     return there

@@ -41,20 +41,23 @@ THICK = 0.2  # slabs, and all shapes in depth [object radii]
 class Softness:
     """How contacts give way.
 
-    `time_constant` t_c is in time steps (MuJoCo resolves no fewer than two), `impedance` d in (0, 1), `slip_damping`
-    b_f in 1/s; `slip_stiffness` is MuJoCo's `impratio`.
+    Time constants are in time steps: `time_constant` t_c of the gap (MuJoCo resolves no fewer than two), and
+    `slip_constant` of the slip, which dies out at the rate `b_f = 1 / (slip_constant * time step)` while friction
+    holds; `impedance` is d in (0, 1), `slip_stiffness` MuJoCo's `impratio`.
 
-    MuJoCo's convex cone couples friction and gap: a contact that slides at `v_t` is lifted by `mu b_f v_t / k`, against
-    the sag above. Where the lift wins, the contact chatters: the more so the harder it is (`d` near 1), the less load
-    it bears, and the larger `b_f`. But a small `b_f` cannot stop what should stick: below a speed of `deceleration /
-    b_f` friction fades out. And a small `d` makes the steps unstable, because MuJoCo's estimate of the inertia that a
-    contact feels leaves out the other contacts: `d` = 0.4 was seen to be so at a `t_c` of two steps, not of three. The
-    defaults lie between; what remains is chatter of lightly loaded contacts that slide fast.
+    Friction is Coulomb's only where slip is faster than `deceleration / b_f`; below that it fades out. An impact at a
+    speed `v_n` decelerates by about `v_n / t_c`: where slip is slower than `mu v_n slip_constant / time_constant`,
+    friction misses part of the impulse that Coulomb's law gives it. But MuJoCo's convex cone couples friction and gap:
+    a contact that slides at `v_t` is lifted by `mu b_f v_t / k`, against the sag above. Where the lift wins, the
+    contact chatters: the more so the harder it is (`d` near 1), the less load it bears, and the smaller
+    `slip_constant`. And a small `d` makes the steps unstable, because MuJoCo's estimate of the inertia that a contact
+    feels leaves out the other contacts: `d` = 0.4 was seen to be so at a `t_c` of two steps, not of three. The defaults
+    lie between; what remains is chatter, by micrometres, of lightly loaded contacts that slide fast.
     """
 
     time_constant: float = 3.0
     impedance: float = 0.5
-    slip_damping: float = 200.0
+    slip_constant: float = 30.0
     slip_stiffness: float = 100.0
 
 
@@ -170,7 +173,7 @@ def _add_pairs(spec, solid, timestep, softness):
     """Declare all pairs that may touch; name -> (row, the object's shape, the hand's shape)."""
     pairs, rows = every_contact(len(solid.vertices)), {}
     columns = (np.asarray(a).tolist() for a in (pairs.link, pairs.kind, pairs.feature))
-    d, b = softness.impedance, softness.slip_damping
+    d, b = softness.impedance, 1 / (softness.slip_constant * timestep)
     for link, kind, feature in zip(*columns, strict=True):
         if feature >= solid.count:
             continue
