@@ -500,6 +500,8 @@ def draw(rows: list[dict]) -> plt.Figure:
         ax.axhline(limit, color="#222222", lw=0.8, ls=":")
         ax.axvspan(-CLEAR, CLEAR, color="#dddddd", lw=0, zorder=0)
         ax.set_yscale("log")
+        ax.set_xscale("symlog", linthresh=2 * CLEAR)  # most plans lie about zero, a few far from it
+        ax.set_xticks([-1, -0.1, 0, 0.1, 1], ["-1", "-0.1", "0", "0.1", "1"])
         ax.set_ylabel(label)
         ax.set_xlabel("predicted least force, over the mean force")
         ax.spines[["top", "right"]].set_visible(False)
