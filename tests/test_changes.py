@@ -38,6 +38,19 @@ def test_three_formations_without_a_stop(flown):
         assert 0 < phase.margin <= float(top.value) + 1e-9
 
 
+def test_changes_are_passed_as_fast_as_asked(flown):
+    """Asking for more than was found raises the speed at the slower change, at some cost to the margin."""
+
+    def slowest(found):
+        last = found.result.phases[1:]
+        return min(float(p.outcome.entered.speed) * float(p.duration) / float(p.traced.table.length) for p in last)
+
+    fast = wa.optimise(flown.scene, knots=31, passing=0.5, traced=tuple(p.traced for p in flown.result.phases))
+    assert slowest(flown) < 0.45 < 0.5 * (1 - 1e-6) < slowest(fast)
+    assert fast.result.status is wa.Status.OK
+    assert 0.98 * flown.result.margin < fast.result.margin < flown.result.margin + 1e-3
+
+
 def test_momentum_balances_and_energy_falls_across_every_change(flown):
     scene = flown.scene
     for before, after in zip(flown.result.phases[:-1], flown.result.phases[1:], strict=True):

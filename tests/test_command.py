@@ -187,6 +187,12 @@ def test_contacts_that_cannot_all_touch(change, key, contact, cause, wholearm, z
     assert_bad_input(answer, f"{path}: {key}: {contact}", "cannot touch", cause, "stays open")
 
 
+@pytest.mark.parametrize("option", ["--rate-limit", "--passing"])
+def test_what_robust_does_not_know(option, wholearm):
+    answer = wholearm("optimise", "heptagon", "--robust", "friction=20%", option, "0.5")
+    assert_bad_input(answer, f"--robust: knows no {option}")
+
+
 @pytest.mark.parametrize("name", ["optimise", "search"])
 def test_contacts_that_cannot_all_touch_stop_every_command(name, wholearm, scene_file):
     path = scene_file(spread)
