@@ -195,11 +195,15 @@ def _arrives(phase, course) -> bool | None:
     share, pace = (float(values[int(motion.count)]) for values in (motion.share, motion.w / length))
     if {ended, phase.status} & UNDECIDED:
         return None
-    there = _off(phase, course) <= 1
+    off = _off(phase, course)
+    there = off <= 1
     if _rests(phase):
         return there and phase.status in (Status.OK, Status.CONTACT_LOST)
     if phase.arrive == "moving":
-        return True if _off(phase, course) <= PASSED else None if there or ended is Status.OK else False
+        late = off > PASSED
+        if late and (there or ended is Status.OK):
+            return None
+        return not late
     if there and (pace > HURRY or share < 1 - EARLY):
         return None
     return there

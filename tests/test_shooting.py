@@ -112,7 +112,7 @@ def test_a_curved_step_starts_along_its_direction_and_keeps_pinned_torques(flip)
     pinned = np.zeros((1, 6), bool)
     pinned[0, 0] = True
     one = jnp.ones(())
-    limits = Limits(jnp.full(2, jnp.inf), one, one, 0 * one, jnp.asarray(pinned), jnp.ones(1))
+    limits = Limits(jnp.full(2, jnp.inf), one[None], one[None], 0 * one, jnp.asarray(pinned), jnp.ones(1))
     _, tangent = jax.jvp(lambda share: moved(p, way, share, tables, limits), (0.0,), (1.0,))
     for got, want in zip(jax.tree.leaves(tangent), jax.tree.leaves(way), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-9)

@@ -86,7 +86,7 @@ def optimise(
     set_: Changes = None,
     knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase.")] = 51,
     steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 160,
-    rate_limit: Annotated[float | None, typer.Option(min=0.0, help="Largest torque rate [N m/s].")] = None,
+    rate_limit: Annotated[float | None, typer.Option(min=1e-9, help="Largest torque rate [N m/s].")] = None,
     passing: Annotated[
         float | None, typer.Option(min=0.0, help="Least speed at changes of formation, over the mean speed (0.2).")
     ] = None,

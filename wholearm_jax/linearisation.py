@@ -21,14 +21,18 @@ from wholearm_jax.stepping import Integration
 class Limits(eqx.Module):
     """What the result must respect: torque rates [N m/s], durations [s], the speed with which phases that do not begin
     at rest are entered at the least (`passing`, in wire lengths a duration), which knots' torques stay as they are;
-    and each phase's `unit` of forces [N]."""
+    and each phase's `unit` of forces [N]. Who begins at rest with a torque that stays may set out without a jerk, its
+    acceleration growing from zero."""
 
     rate: Float[Array, "2"]
-    shortest: Float[Array, ""]
-    longest: Float[Array, ""]
+    shortest: Float[Array, "phases"]
+    longest: Float[Array, "phases"]
     passing: Float[Array, ""]
     pinned: Bool[Array, "phases knots"]
     unit: Float[Array, "phases"]
+
+
+OF_PHASES = Limits(rate=None, shortest=0, longest=0, passing=None, pinned=0, unit=0)  # pyright: ignore
 
 
 class Rooms(NamedTuple):
@@ -54,8 +58,9 @@ class Linear(NamedTuple):
     still: Bool[Array, "p"]
 
 
-def rooms(q: Float[Array, "7"], slowest, unit, table: Table, limits: Limits, how, intervals: int) -> Rooms:
-    """One interval; `slowest` is the least speed with which it may begin, and -inf where it starts at rest."""
+def rooms(q: Float[Array, "7"], slowest, table: Table, limits: Limits, how, intervals: int) -> Rooms:
+    """One interval; `slowest` is the least speed with which it may begin, and -inf where it starts at rest; `limits`
+    are those of its phase."""
     shot = shoot(table, how, intervals, q)
     torque, log = q[2:6], q[6]
     bounded = jnp.isfinite(limits.rate)
@@ -65,12 +70,13 @@ def rooms(q: Float[Array, "7"], slowest, unit, table: Table, limits: Limits, how
     free = span > 0
     ends = jnp.stack([log - jnp.log(limits.shortest), jnp.log(limits.longest) - log]) / jnp.where(free, span, 1.0)
     later = slowest > -jnp.inf
-    pace = shot.pace.at[0].add(jnp.where(later, -slowest, 0.0))
-    room = [(shot.forces / unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, pace, ends]
+    pace = shot.pace.at[0].add(-jnp.where(later, slowest, 0.0))
+    room = [(shot.forces / limits.unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, pace, ends]
     one = jnp.full((), 1 / intervals)
     sampled = (shot.weight[:, None] * ~spare(table)).ravel()
     climbs = jnp.tile(jnp.where(bounded, one / 4, 0.0), 2)
-    paces = shot.pace_weight.at[0].multiply(later)
+    # From rest the first coefficient is the speed, zero, and the second the acceleration.
+    paces = shot.pace_weight.at[0].multiply(later).at[1].multiply(later | ~limits.pinned[0])
     weight = [sampled, jnp.full(8, one / 4), climbs, paces, jnp.full(2, jnp.where(free, one / 4, 0.0))]
     return Rooms(jnp.concatenate(room), jnp.concatenate(weight), shot.end)
 
@@ -79,13 +85,13 @@ def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> 
     """Simulate all intervals, with first derivatives by forward mode."""
     phases, knots = p.torque.shape[:2]
 
-    def both(q, slowest, unit, table):
-        at = rooms(q, slowest, unit, table, limits, how, knots - 1)
+    def both(q, slowest, table, limits):
+        at = rooms(q, slowest, table, limits, how, knots - 1)
         return at, at
 
-    each = jax.vmap(jax.vmap(jax.jacfwd(both, has_aux=True), (0, 0, None, None)))
+    each = jax.vmap(jax.vmap(jax.jacfwd(both, has_aux=True), (0, 0, None, None)), (0, 0, 0, OF_PHASES))
     slowest = jnp.zeros((phases, knots - 1)).at[:, 0].set(limits.passing).at[0, 0].set(-jnp.inf)
-    rates, at = each(local(p), slowest, limits.unit, tables)
+    rates, at = each(local(p), slowest, tables, limits)
     columns, ends = _columns(phases, knots)
     row = np.arange(ends.size)
     n = 4 * phases * knots + phases
@@ -150,7 +156,7 @@ def _still(limits: Limits, phases: int, knots: int) -> Bool[Array, "p"]:
     """Pinned torques, the places where wires start and end, rest at the first start and last end, fixed durations."""
     ends = np.zeros((phases, knots, 2), bool)
     ends[:, [0, -1], 0] = ends[0, 0] = ends[-1, -1] = True
-    fixed = jnp.broadcast_to(limits.longest <= limits.shortest, (phases,))
+    fixed = limits.longest <= limits.shortest
     return jnp.concatenate([jnp.repeat(limits.pinned.ravel(), 2), jnp.asarray(ends.ravel()), fixed])
 
 

@@ -266,13 +266,15 @@ def _departure(table, seen, state):
     low = jnp.maximum(seen.share[:-1], state.share)
     high = jnp.minimum(seen.share[1:], 1.0)
     live = (rows >= seen.first) & (rows <= seen.last) & (high >= low)
+    # Who starts as an interval ends starts with the next one: no step fits in between.
+    inside = high - 8 * jnp.finfo(high.dtype).eps
     tau_low = jax.vmap(torque_in, (None, 0, 0))(seen, rows, low)
 
     def first(pull):
         value = pull[0] + tau_low @ pull[1:]
         rate = seen.slope @ pull[1:]
         root = low - value / jnp.where(rate > 0, rate, 1.0)
-        at = jnp.where(value > 0, low, jnp.where((rate > 0) & (root < high), root, jnp.inf))
+        at = jnp.where(value > 0, low, jnp.where((rate > 0) & (root < inside), root, jnp.inf))
         at = jnp.where(live, at, jnp.inf)
         k = jnp.argmin(stop_gradient(at))
         return at[k]

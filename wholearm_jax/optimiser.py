@@ -7,6 +7,7 @@ margin falls, and keeps the best schedule whose honest simulation succeeds.
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ import optax
 
 from wholearm_jax.descent import advance, begin, interior_point, projected
 from wholearm_jax.guesses import guesses
+from wholearm_jax.handover import Handover, handovers, steady
 from wholearm_jax.linearisation import Limits
 from wholearm_jax.pacing import HOW, Problem, Step, descend
 from wholearm_jax.phase import Traced, balance_at_start, run
@@ -28,7 +30,7 @@ from wholearm_jax.programs import Program
 from wholearm_jax.reduction import blank
 from wholearm_jax.result import Result, describe, stays
 from wholearm_jax.scene import Phase, Scene, replace_duration
-from wholearm_jax.schedule import Torque, padded, rounded
+from wholearm_jax.schedule import Torque, evenly, padded, rounded
 from wholearm_jax.shooting import Variables
 from wholearm_jax.squeeze import Bound, bound
 from wholearm_jax.status import Status
@@ -36,6 +38,8 @@ from wholearm_jax.stepping import Integration
 from wholearm_jax.wire import Resolution
 
 TORQUE_SHARE = 0.9  # share of the torque limits that a start may use
+LEADS = (0.25, 0.1)  # shares of a phase for which its object may wait before it sets out, where rates are limited
+SHORTEST = 0.01  # share of its longest time that a phase moves at the least
 PASSING = 0.2  # least speed with which a phase is entered that does not begin at rest, over its mean speed
 GOOD = 0.99  # share of the bound with which no further start is tried
 
@@ -77,9 +81,9 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
 
     def torques(at, phase):
         if phase.arrive == "hold":
-            return _steady(scene, phase, at, knots)
+            return steady(scene, phase, at, knots)
         start = guesses([at], [float(phase.duration)], knots, 1.0)[0]
-        return _evenly(float(phase.duration), at.table.torque_limit * start.torque[0])
+        return evenly(float(phase.duration), at.table.torque_limit * start.torque[0])
 
     return _in_turn([torques(*pair) for pair in zip(traced, scene.phases, strict=True)])
 
@@ -126,41 +130,69 @@ def optimise(
     """Find the torque schedule with the largest compressive margin by gradient descent through the simulation.
 
     Each phase must arrive at its planned end in time, at rest or, where the next takes over, `moving`; `knots` torques
-    a joint and phase, evenly spaced in time, are linear in between. The scene's torque limits hold, and `rate_limit`
-    [N m/s] if given. `durations = (shortest, longest)` lets each phase choose its own. Formations that take over at
-    speed are entered with at least `passing` times their phase's mean speed (wire over duration): an object that hardly
-    moves where its formation changes may as well stop short of it. `optimiser` replaces the interior point by any optax
-    optimiser (`descent.projected`). A phase stops when its margin comes within `tolerance` of the bound or no longer
-    improves by that share, or after `steps`. `callback` sees every step; `traced` reuses the result of `trace`. A phase
-    that holds the object keeps its duration and gets the best torque of its statics, approached as fast as `rate_limit`
-    allows. Where no torque can hold a formation, nothing is searched and the status says so.
+    a joint and phase, evenly spaced over the time for which it moves, are linear in between. The scene's torque limits
+    hold, and `rate_limit` [N m/s] if given: then torques do not step where phases change either, and an object may
+    wait, held by friction, for up to a quarter of a phase until the torque sets it out (`handover`). `durations =
+    (shortest, longest)` lets each phase choose its own. Formations that take over at speed are entered with at least
+    `passing` times their phase's mean speed (wire over duration): an object that hardly moves where its formation
+    changes may as well stop short of it. `optimiser` replaces the interior point by any optax optimiser
+    (`descent.projected`). A phase stops when its margin comes within `tolerance` of the bound or no longer improves by
+    that share, or after `steps`. `callback` sees every step; `traced` reuses the result of `trace`. A phase
+    that holds the object keeps its duration and gets the best torque of its statics, approached and left as fast as
+    `rate_limit` allows. Where no torque can hold a formation, nothing is searched and the status says so.
 
-    Derivation, section 9. Raises RuntimeError without float64.
+    Derivation, section 9. Raises RuntimeError without float64, ValueError for a `rate_limit` that is not positive.
 
     >>> found = wa.optimise(wa.load("heptagon"))
     >>> found.result.status.label, [f"{share:.2f}" for share in found.reached]
     ('ok', ['1.00', '1.00'])
     """
     require_x64()
-    joint, rows = _groups(scene), rounded(knots * len(scene.phases))
+    if rate_limit is not None and not rate_limit > 0:
+        raise ValueError("rate_limit must be positive")
     ready = compile_ahead(scene, knots=knots, optimiser=optimiser)
     traced = traced or trace(scene)
     tops = bounds(scene, traced=traced)
     for one in ready:
         one.result()
-    found, history, stopped = [], [], []
-    for group in joint:
+    wanted = _Wanted(knots, _rows(scene, knots), steps, rate_limit, durations, passing, optimiser, tolerance, callback)
+    found = []
+    for lead in LEADS if rate_limit is not None else LEADS[:1]:
+        found.append(_attempt(scene, traced, tops, wanted, lead))
+        if found[-1].result.status is Status.OK:
+            return found[-1]
+    return max(found, key=lambda one: one.result.margin)
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """What `optimise` was asked for; `rows` is the size of the whole plan's schedule: those of one share programs."""
+
+    knots: int
+    rows: int
+    steps: int
+    rate_limit: float | None
+    durations: tuple[float, float] | None
+    passing: float
+    optimiser: optax.GradientTransformation | None
+    tolerance: float
+    callback: Callable[[Step], None] | None
+
+
+def _attempt(scene: Scene, traced, tops, wanted: _Wanted, lead: float) -> Optimised:
+    """All phases one after the other, objects waiting at most a share `lead` of a phase before they set out."""
+    groups, found, history, stopped = _groups(scene), [], [], []
+    changes: list[Handover | None] = [None] * (len(groups) - 1)
+    if wanted.rate_limit is not None:
+        changes = handovers(scene, groups, traced, tops, wanted.rate_limit, lead, wanted.durations)
+    for group, ends in zip(groups, itertools.pairwise([None, *changes, None]), strict=True):
         parts = tuple(scene.phases[k] for k in group)
-        before = found[-1].values[-1] if rate_limit is not None and found else None
         if parts[0].arrive == "hold":
-            found.append(_steady(scene, parts[0], traced[group[0]], knots, rate_limit, before))
+            found.append(steady(scene, parts[0], traced[group[0]], wanted.knots, wanted.rate_limit, *ends))
             stopped.append("the best torque of a linear programme")
             continue
-        own = [traced[k] for k in group], [tops[k] for k in group]
-        task = _Task(group[0], parts, *own, knots, rows, steps, tolerance)
-        limits = _limits(task, rate_limit, durations, passing, before)
-        method = _method(optimiser, len(group))
-        schedules, why, taken = _optimise_group(scene, task, limits, before, method, callback)
+        task = _Task(group[0], parts, [traced[k] for k in group], [tops[k] for k in group], *ends, wanted)
+        schedules, why, taken = _optimise_group(scene, task)
         found += schedules
         stopped += [why] * len(group)
         history += taken
@@ -176,9 +208,14 @@ def compile_ahead(
     scene: Scene, *, knots: int = 51, optimiser: optax.GradientTransformation | None = None
 ) -> list[Future[None]]:
     """Begin to compile the programs of `optimise` in threads of their own, as can be done while wires are traced."""
-    rows = rounded(knots * len(scene.phases))
+    rows = _rows(scene, knots)
     sizes = {len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"}
     return [_ahead(n, knots, rows, _method(optimiser, n)) for n in sorted(sizes)]
+
+
+def _rows(scene: Scene, knots: int) -> int:
+    """Room for the whole plan's schedule, and for what stands before its phases where rates are limited."""
+    return rounded((knots + 1) * len(scene.phases))
 
 
 def _groups(scene: Scene) -> list[list[int]]:
@@ -196,14 +233,38 @@ class _Task:
     phases: tuple[Phase, ...]
     traced: list[Traced]
     tops: list[Bound]
-    knots: int
-    rows: int  # of the whole plan's schedule: one of the same size shares its program
-    steps: int
-    tolerance: float
+    begin: Handover | None  # where torque rates are limited, and a phase stands before
+    end: Handover | None  # or behind
+    wanted: _Wanted
+
+    @property
+    def pins(self) -> dict[tuple[int, int], np.ndarray]:
+        """Torques that stay as they are, in units of their limits, by phase and knot."""
+        begin = [] if self.begin is None else [((0, 0), self.begin, self.begin.begin / self.limits[0])]
+        end = [] if self.end is None else [((-1, -1), self.end, self.end.torque / self.limits[-1])]
+        return {at: torque for at, change, torque in [*begin, *end] if change.share > 0}
+
+    @property
+    def most(self) -> float:
+        """The share of the bounds that the torques at both ends allow."""
+        changes = [change.share for change in (self.begin, self.end) if change is not None and change.share > 0]
+        return min([1.0, *changes])
+
+    @property
+    def lead(self) -> np.ndarray:
+        """How long the object waits in each phase before it sets out."""
+        first = self.begin.lead if self.begin is not None else 0.0
+        return np.append(first, np.zeros(len(self.phases) - 1))
 
     @property
     def durations(self) -> np.ndarray:
-        return np.array([float(p.duration) for p in self.phases])
+        """How long it moves in each."""
+        return np.array([float(p.duration) for p in self.phases]) - self.lead
+
+    @property
+    def limits(self) -> np.ndarray:
+        """The largest torques of each [N m]."""
+        return np.stack([np.asarray(at.table.torque_limit) for at in self.traced])
 
     @property
     def bounds(self) -> np.ndarray:
@@ -212,60 +273,45 @@ class _Task:
     def problem(self, limits: Limits) -> Problem:
         """What is descended on."""
         tables = _stacked([at.table for at in self.traced])
-        return Problem(self.index, tables, self.bounds, limits, self.steps, self.tolerance)
+        return Problem(self.index, tables, self.bounds, limits, self.wanted.steps, self.wanted.tolerance)
 
 
-def _steady(scene: Scene, phase: Phase, at: Traced, knots: int, rate_limit=None, before=None) -> Torque:
-    """The best torque to hold an object, from time 0; from the torque `before` straight there at a limited rate.
-
-    The margin is concave in the torque, so that it is nowhere on that way less than at both its ends.
-    """
-    if int(at.table.status) != Status.OK:
-        return _evenly(float(phase.duration), np.zeros((knots, 2)))
-    balance, departure = balance_at_start(scene, phase, at)
-    best = balance.steadiest(departure).torque
-    if before is None or rate_limit is None:
-        return _evenly(float(phase.duration), np.tile(best, (knots, 1)))
-    way = best - np.asarray(before)
-    reach = rate_limit * np.linspace(0.0, float(phase.duration), knots)
-    share = np.minimum(reach / max(np.abs(way).max(), 1e-300), 1.0)
-    return _evenly(float(phase.duration), np.asarray(before) + share[:, None] * way)
-
-
-def _optimise_group(
-    scene, task: _Task, limits: Limits, before, method, callback
-) -> tuple[list[Torque], str, list[Step]]:
+def _optimise_group(scene: Scene, task: _Task) -> tuple[list[Torque], str, list[Step]]:
     """Descend from one start after the other, until one comes near the bound or two agree.
 
     Returns the best schedules (each from time 0), why their descent stopped, and the steps taken.
     """
-    blank_values = np.zeros((task.knots, 2))
+    wanted, tolerance = task.wanted, task.wanted.tolerance
     for at in task.traced:
         if int(at.table.status) != Status.OK:
             why = f"the wire cannot be followed: {Status(int(at.table.status)).label}"
-            return [_evenly(t, blank_values) for t in task.durations], why, []
-    begins = guesses(task.traced, task.durations, task.knots, TORQUE_SHARE)
-    best = begins[0]
+            return [evenly(t, np.zeros((wanted.knots, 2))) for t in task.durations], why, []
+    begins = guesses(task.traced, task.durations, wanted.knots, TORQUE_SHARE)
     weakest = int(np.argmin(task.bounds))
     if task.bounds[weakest] <= 0:
         where = 100 * float(task.tops[weakest].share)
         why = f"no torque within limits holds this formation at {where:.0f} % of its wire"
-        return _schedules(task, best), why, []
-    problem, best_key, reason, history = task.problem(limits), (False, -np.inf), "", []
+        return _schedules(task, begins[0]), why, []
+    if task.begin is not None and not task.begin.share > 0:
+        return _schedules(task, begins[0]), "no torque lets this formation take over at the limited rate", []
+    problem, method, found, history = task.problem(_limits(task)), _method(wanted.optimiser, len(task.phases)), [], []
     for number, start in enumerate(begins):
-        if before is not None:
-            limit = task.traced[0].table.torque_limit
-            start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[0, 0].set(before / limit))
-        p, why, taken = descend(problem, start, number, method, callback)
+        for at, torque in task.pins.items():
+            start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[at].set(torque))
+        p, why, taken = descend(problem, start, number, method, wanted.callback)
         history += taken
-        key = _honest(scene, task, p)
-        agree = key[0] and best_key[0] and abs(key[1] - best_key[1]) <= task.tolerance
-        if key > best_key:
-            best, best_key, reason = p, key, why
-        if agree or (best_key[0] and best_key[1] >= GOOD):
+        fine, share = _honest(scene, task, p)
+        best = max((other for ok, other, *_ in found if ok), default=np.nan)
+        agree = fine and abs(share - best) <= tolerance
+        found.append((fine, share, why, p))
+        if agree or (fine and share >= GOOD * task.most):
             break
-    reached = best_key[0] and best_key[1] >= 1 - task.tolerance
-    return _schedules(task, best), f"within {task.tolerance:g} of the bound" if reached else reason, history
+    fine, share, why, p = max(found, key=lambda one: one[:2])
+    return (
+        _schedules(task, p),
+        f"within {tolerance:g} of the bound" if fine and share >= 1 - tolerance else why,
+        history,
+    )
 
 
 @functools.cache
@@ -280,13 +326,14 @@ def _compile(phases: int, knots: int, rows: int, method) -> None:
     """Run the descent's programs once, on blank tables."""
     table = blank(Resolution())
     tables = _stacked([table] * phases)
-    plain = (np.full(2, np.inf), _ONE, _ONE, 0 * _ONE, np.zeros((phases, knots), bool), np.ones(phases))
+    each = np.ones(phases)
+    plain = (np.full(2, np.inf), each, each, 0 * _ONE, np.zeros((phases, knots), bool), each)
     limits = Limits(*(array(a) for a in plain))
     empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
     p = Variables(*(array(a) for a in empty))
     advance(begin(p, method), tables, limits, HOW, method)
     zero, one = array(0.0), array(1.0)
-    run(table, padded(_evenly(1.0, empty[0][0]), rows), zero, one, Integration(), "rest")
+    run(table, padded(evenly(1.0, empty[0][0]), rows), zero, one, Integration(), "rest")
 
 
 @functools.cache
@@ -298,26 +345,25 @@ def _method(optimiser, phases: int):
 _ONE = np.ones(())
 
 
-def _evenly(duration, values) -> Torque:
-    return Torque(array(np.linspace(0.0, float(duration), len(values))), array(values))
-
-
 _stacked = jax.jit(stacked)
 
 
 def _schedules(task: _Task, p: Variables) -> list[Torque]:
     """Each phase's schedule, from time 0."""
-    limits = np.stack([np.asarray(at.table.torque_limit) for at in task.traced])
-    values, lengths = np.asarray(p.torque) * limits[:, None], np.exp(np.asarray(p.log_duration))
-    return [_evenly(length, rows) for length, rows in zip(lengths, values, strict=True)]
+    values, lengths = np.asarray(p.torque) * task.limits[:, None], np.exp(np.asarray(p.log_duration))
+    first, *others = [evenly(length, rows) for length, rows in zip(lengths, values, strict=True)]
+    if task.begin is not None and task.begin.lead > 0:
+        times = np.append(0.0, task.begin.lead + np.asarray(first.times))
+        first = Torque(array(times), array(np.vstack([task.begin.torque, first.values])))
+    return [first, *others]
 
 
 def _honest(scene: Scene, task: _Task, p: Variables) -> tuple[bool, float]:
     """Whether a simulation of the schedules says `ok`, holds included, and the least margin over its bound."""
     start, shares, fine, arriving = 0.0, [], [], None
     torque = _in_turn(_schedules(task, p))
-    schedule = padded(torque, task.rows)
-    ends = np.cumsum(np.exp(np.asarray(p.log_duration)))
+    schedule = padded(torque, task.wanted.rows)
+    ends = np.cumsum(np.exp(np.asarray(p.log_duration)) + task.lead)
     for phase, at, end, top in zip(task.phases, task.traced, ends, task.bounds, strict=True):
         one = run(at.table, schedule, start, end - start, Integration(), phase.arrive, arriving)
         start += float(one.duration) * float(np.asarray(one.motion.share)[int(one.motion.count)])
@@ -339,11 +385,12 @@ def _in_turn(schedules: list[Torque]) -> Torque:
 _bound = Program(bound)
 
 
-def _limits(task: _Task, rate_limit, durations, passing, before) -> Limits:
-    lengths = task.durations
-    shortest, longest = durations or (lengths.min(), lengths.min())
-    rate = np.full(2, np.inf if rate_limit is None else float(rate_limit))
-    pinned = np.zeros((len(lengths), task.knots), bool)
-    pinned[0, 0] = before is not None
-    unit = np.maximum(task.bounds, 1e-300)
-    return Limits(*(array(a) for a in (rate, shortest * _ONE, longest * _ONE, passing * _ONE, pinned, unit)))
+def _limits(task: _Task) -> Limits:
+    lengths, asked = task.durations, task.wanted
+    shortest, longest = (lengths, lengths) if asked.durations is None else (t - task.lead for t in asked.durations)
+    rate = np.full(2, np.inf if asked.rate_limit is None else float(asked.rate_limit))
+    pinned = np.zeros((len(lengths), asked.knots), bool)
+    for at in task.pins:
+        pinned[at] = True
+    shortest, unit = np.maximum(shortest, SHORTEST * longest), np.maximum(task.bounds, 1e-300)
+    return Limits(*(array(a) for a in (rate, shortest, longest, asked.passing * _ONE, pinned, unit)))

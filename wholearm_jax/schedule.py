@@ -60,6 +60,11 @@ def torque(times, values) -> Torque:
     return Torque(times, values)
 
 
+def evenly(duration, values) -> Torque:
+    """A schedule of evenly spaced rows from time 0."""
+    return Torque(array(np.linspace(0.0, float(duration), len(values))), array(values))
+
+
 def has_steps(schedule: Torque, start: float, end: float) -> bool:
     """Whether the schedule steps strictly between two times (a static choice for the integrator)."""
     times = np.asarray(schedule.times)

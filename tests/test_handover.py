@@ -1,0 +1,134 @@
+"""Torques where one phase gives way to another at rest and torque rates are limited."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.handover import SURE, Moving, Near, Resting, handover
+from wholearm_jax.phase import balance_at_start
+from wholearm_jax.reduction import on_panel, powers
+from wholearm_jax.scene_file import to_dict
+from wholearm_jax.squeeze import hold
+
+RATE = 2.0
+LEAD = 0.25
+
+
+def at_rest(table, piece, s, torque):
+    """Acceleration and contact forces at a place of a wire at rest."""
+    panel, xi = powers(table, piece, s)
+    terms = jnp.stack([1.0, 0.0, 0.0, *torque])
+    return float(on_panel(table.acceleration, panel, xi) @ terms), np.asarray(on_panel(table.force, panel, xi) @ terms)
+
+
+@pytest.fixture(scope="module", params=["heptagon", "hexagon"])
+def change(request):
+    """A bundled plan's change of formation: the wire that ends, the rest there, and the motion that follows."""
+    scene = wa.load(request.param)
+    traced = wa.trace(scene)
+    first, second = (float(top.value) for top in wa.bounds(scene, traced=traced))
+    before, onward = Moving(traced[0].table, 1.0, first), Moving(traced[1].table, 1.0, second)
+    return before, Resting(*balance_at_start(scene, scene.phases[1], traced[1]), second), onward
+
+
+def share_of(change, torque, begin):
+    """The least margin over its bound with which two torques serve a change, -inf where they do not: by definition."""
+    before, rest, onward = change
+    table, start = before.table, onward.table.breaks[0]
+    braking, forces = at_rest(table, table.count - 1, table.breaks[-1], torque)
+    setting_out, next_forces = at_rest(onward.table, 0, start, begin)
+    one, limit = np.append(1.0, torque), rest.balance.torque_limit
+    ahead, behind = ((row @ one) / np.linalg.norm(row[1:] * limit) for row in rest.departure)
+    stays = ahead <= 1e-9 - SURE and behind >= SURE - 1e-9
+    if not (stays and braking < 0 and abs(setting_out) < 1e-6):
+        return -np.inf
+    held = rest.balance.support(torque).margin / rest.bound
+    return min(forces.min() / before.bound, next_forces.min() / onward.bound, held)
+
+
+def test_both_torques_serve_and_the_way_between_them_is_short_enough(change):
+    before, rest, onward = change
+    found = handover(before, rest, onward, RATE, LEAD)
+    assert 0.5 < found.share <= 1
+    assert share_of(change, found.torque, found.begin) == pytest.approx(found.share, rel=1e-6)
+    assert 0 < found.lead <= LEAD
+    assert np.abs(found.begin - found.torque).max() == pytest.approx(RATE * found.lead, rel=1e-9)
+    acceleration, _ = at_rest(onward.table, 0, onward.table.breaks[0], found.begin)
+    assert acceleration == pytest.approx(0.0, abs=1e-9)
+
+
+def test_no_torques_nearby_or_far_serve_better(change):
+    before, rest, onward = change
+    found = handover(before, rest, onward, RATE, LEAD)
+    rng, limit, ahead = np.random.default_rng(1), rest.balance.torque_limit, rest.departure.ahead
+    best, tried = -np.inf, 0
+    for size in np.repeat([1e-3, 1e-2, 0.1, 0.5], 100):
+        torque = np.clip(found.torque + size * rng.normal(size=2), -limit, limit)
+        begin = found.begin + size * rng.normal(size=2)
+        begin -= ahead[1:] * (ahead @ np.append(1.0, begin)) / (ahead[1:] @ ahead[1:])
+        if np.all(np.abs(begin) <= limit) and np.abs(begin - torque).max() <= RATE * LEAD:
+            share = share_of(change, torque, begin)
+            tried, best = tried + np.isfinite(share), max(best, share)
+    assert tried > 10
+    assert best <= found.share / 0.99 + 1e-9, "the shortest way gives up a hundredth of the margin"
+
+
+def test_a_torque_out_of_reach_is_none(change):
+    before, rest, onward = change
+    from_far = Near(-rest.balance.torque_limit, 0.01)
+    assert handover(before, rest, onward, RATE, LEAD, from_far).share == -np.inf
+    free = handover(before, rest, onward, RATE, LEAD)
+    near = handover(before, rest, onward, RATE, LEAD, Near(free.torque, 0.01))
+    assert np.abs(near.torque - free.torque).max() <= 0.01 + 1e-9
+
+
+@pytest.mark.parametrize(("name", "rate"), [("heptagon", 2.0), ("hexagon", 2.0), ("tipping", 10.0)])
+def test_whole_plans_keep_a_limited_rate(name, rate):
+    found = wa.optimise(wa.load(name), rate_limit=rate)
+    assert found.result.status is wa.Status.OK, found.result.message
+    assert min(found.reached) > 0.6
+    times, values = np.asarray(found.torque.times), np.asarray(found.torque.values)
+    steps, span = np.abs(np.diff(values, axis=0)).max(1), np.diff(times)
+    assert np.all(steps <= rate * (1 + 1e-6) * span + 1e-12), "between knots as between phases"
+    assert [float(p.duration) for p in found.scene.phases] == pytest.approx([1.0, 1.0])
+
+
+def test_an_object_that_is_held_between_phases_sets_out_at_a_limited_rate():
+    data = to_dict(wa.load("heptagon"))
+    slide, flip = data["phase"]
+    pause = {"name": "pause", "contacts": slide["contacts"], "hold": True, "duration": 0.5}
+    found = wa.optimise(wa.parse(data | {"phase": [slide, pause, flip]}), rate_limit=3.0)
+    assert found.result.status is wa.Status.OK, found.result.message
+    assert found.result.hold_margin > 0.5
+    times, values = np.asarray(found.torque.times), np.asarray(found.torque.values)
+    assert np.all(np.abs(np.diff(values, axis=0)).max(1) <= 3.0 * (1 + 1e-6) * np.diff(times) + 1e-12)
+
+
+def test_where_no_torques_serve_the_reason_is_told():
+    found = wa.optimise(wa.load("heptagon"), rate_limit=0.2)
+    assert found.result.status is not wa.Status.OK
+    assert found.result.phases[0].status is wa.Status.OK
+    assert found.stopped[1] == "no torque lets this formation take over at the limited rate"
+
+
+def test_a_rate_limit_is_positive():
+    with pytest.raises(ValueError, match="rate_limit must be positive"):
+        wa.optimise(wa.load("heptagon"), rate_limit=0.0)
+
+
+def test_an_object_sets_out_at_a_knot_at_which_its_acceleration_begins_to_grow():
+    """Whatever the rounding of the time at which it does: just before the knot no step fits in."""
+    scene = wa.load("hexagon")
+    scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
+    traced = wa.trace(scene)
+    table = traced[0].table
+    balanced, pushed, pressed = (np.asarray(hold(table, table.breaks[0], 0.0, a).torque) for a in (0.0, 4.0, -0.5))
+    for knot in np.random.default_rng(2).uniform(0.05, 0.5, 40):
+        schedule = wa.torque([0.0, knot, 1.0], np.stack([pressed, balanced, pushed]))
+        (phase,) = wa.simulate(scene, schedule, traced=traced).phases
+        assert phase.status not in (wa.Status.NO_CONVERGENCE, wa.Status.MAX_STEPS), knot
+        motion = phase.outcome.motion
+        assert bool(motion.held[0])
+        assert float(motion.share[1]) == pytest.approx(knot, abs=1e-12)
