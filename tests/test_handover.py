@@ -9,8 +9,8 @@ import wholearm_jax as wa
 from wholearm_jax.handover import SURE, Moving, Near, Resting, handover
 from wholearm_jax.phase import balance_at_start
 from wholearm_jax.reduction import on_panel, powers
+from wholearm_jax.scene import replace_duration
 from wholearm_jax.scene_file import to_dict
-from wholearm_jax.squeeze import hold
 
 RATE = 2.0
 LEAD = 0.25
@@ -84,15 +84,25 @@ def test_a_torque_out_of_reach_is_none(change):
     assert np.abs(near.torque - free.torque).max() <= 0.01 + 1e-9
 
 
-@pytest.mark.parametrize(("name", "rate"), [("heptagon", 2.0), ("hexagon", 2.0), ("tipping", 10.0)])
-def test_whole_plans_keep_a_limited_rate(name, rate):
-    found = wa.optimise(wa.load(name), rate_limit=rate)
+@pytest.mark.parametrize(
+    ("name", "duration", "rate"),
+    [
+        ("heptagon", 1.0, 2.0),
+        ("hexagon", 1.0, 2.0),
+        ("tipping", 1.0, 10.0),
+        ("hexagon", 0.3, 20.0),  # where rounding has the object set out just before a knot, and no step fits in
+    ],
+)
+def test_whole_plans_keep_a_limited_rate(name, duration, rate):
+    scene = wa.load(name)
+    phases = tuple(replace_duration(phase, duration) for phase in scene.phases)
+    found = wa.optimise(eqx.tree_at(lambda s: s.phases, scene, phases), rate_limit=rate)
     assert found.result.status is wa.Status.OK, found.result.message
     assert min(found.reached) > 0.6
     times, values = np.asarray(found.torque.times), np.asarray(found.torque.values)
     steps, span = np.abs(np.diff(values, axis=0)).max(1), np.diff(times)
     assert np.all(steps <= rate * (1 + 1e-6) * span + 1e-12), "between knots as between phases"
-    assert [float(p.duration) for p in found.scene.phases] == pytest.approx([1.0, 1.0])
+    assert [float(p.duration) for p in found.scene.phases] == pytest.approx([duration, duration])
 
 
 def test_an_object_that_is_held_between_phases_sets_out_at_a_limited_rate():
@@ -116,19 +126,3 @@ def test_where_no_torques_serve_the_reason_is_told():
 def test_a_rate_limit_is_positive():
     with pytest.raises(ValueError, match="rate_limit must be positive"):
         wa.optimise(wa.load("heptagon"), rate_limit=0.0)
-
-
-def test_an_object_sets_out_at_a_knot_at_which_its_acceleration_begins_to_grow():
-    """Whatever the rounding of the time at which it does: just before the knot no step fits in."""
-    scene = wa.load("hexagon")
-    scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
-    traced = wa.trace(scene)
-    table = traced[0].table
-    balanced, pushed, pressed = (np.asarray(hold(table, table.breaks[0], 0.0, a).torque) for a in (0.0, 4.0, -0.5))
-    for knot in np.random.default_rng(2).uniform(0.05, 0.5, 40):
-        schedule = wa.torque([0.0, knot, 1.0], np.stack([pressed, balanced, pushed]))
-        (phase,) = wa.simulate(scene, schedule, traced=traced).phases
-        assert phase.status not in (wa.Status.NO_CONVERGENCE, wa.Status.MAX_STEPS), knot
-        motion = phase.outcome.motion
-        assert bool(motion.held[0])
-        assert float(motion.share[1]) == pytest.approx(knot, abs=1e-12)
