@@ -246,6 +246,20 @@ def test_command(wholearm, tmp_path):
     assert (model.nq, model.nu, model.opt.timestep) == (5, 2, pytest.approx(5e-4))
 
 
+def test_a_contact_that_rolls_is_executed(wholearm, tmp_path):
+    """An object tips over a vertex that should not slip, and back; nothing in the execution says that it must roll."""
+    torque = ("--torque", DATA / "tipping_torque.csv")
+    code, out, err = wholearm("execute", "tipping", *torque, "--perturb", 1, "--out", tmp_path)
+    assert (code, err) == (0, ""), out
+    content = json.loads((tmp_path / "execution.json").read_text())
+    assert content["position_error"] < 5e-4
+    assert abs(content["angle_error"]) < 0.01
+    header, *rows = (tmp_path / "execution.csv").read_text().splitlines()
+    column = header.split(",").index("cn palm:v0")
+    assert np.median([float(row.split(",")[column]) for row in rows]) > 1.0
+    assert (tmp_path / "execution.png").stat().st_size > 10_000
+
+
 @pytest.mark.parametrize(
     ("more", "cause"),
     [

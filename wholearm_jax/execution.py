@@ -25,7 +25,7 @@ from wholearm_jax.free_bodies import FreeBodies, Softness, free_bodies
 from wholearm_jax.phase import destination
 from wholearm_jax.result import Result
 from wholearm_jax.sampling import trajectory
-from wholearm_jax.scene import Body, Formation, Hand, Scene, body, formation
+from wholearm_jax.scene import Body, Formation, Hand, Scene, body, formation, pair_name
 from wholearm_jax.schedule import Torque
 from wholearm_jax.status import Status
 
@@ -74,7 +74,8 @@ class Execution:
     """An executed plan beside its prediction.
 
     `course` is what happened, at every step; `expected` what was predicted (NaN: friction holds the object at rest, or
-    the prediction ended). Their contacts are `names`, all pairs that may touch; `planned` are those of the phases.
+    the prediction ended). Their contacts are `names`, all pairs that may touch; `planned` are those of the phases,
+    which do not say here whether they should roll.
     """
 
     prediction: Result
@@ -92,7 +93,7 @@ class Execution:
     @property
     def planned(self) -> tuple[str, ...]:
         """The contacts of all phases, each once."""
-        return tuple(dict.fromkeys(name for phase in self.prediction.phases for name in phase.contacts))
+        return tuple(dict.fromkeys(pair_name(name) for phase in self.prediction.phases for name in phase.contacts))
 
     @property
     def position_error(self) -> float:
@@ -114,7 +115,7 @@ class Execution:
     def force(self, contact: str, times=None) -> Float[np.ndarray, "times"]:
         """A contact's executed normal force [N] at given times, by default those of `expected`."""
         times = self.expected.time if times is None else times
-        return np.interp(times, self.course.time, self.course.cn[:, self.names.index(contact)])
+        return np.interp(times, self.course.time, self.course.cn[:, self.names.index(pair_name(contact))])
 
 
 def execute(
@@ -240,7 +241,7 @@ def _touching(solid: Body, hand: Hand, pairs: Formation, z, slack):
 
 def judge(scene: Scene, z, target, tolerance: Tolerance) -> tuple[Ending, tuple[str, ...]]:
     """What became of an execution that ended at `z`, and which contacts of the last phase are open."""
-    names = scene.phases[-1].formation.names
+    names = tuple(map(pair_name, scene.phases[-1].formation.names))
     closed = touching(scene, names, z[None], tolerance.position)[0]
     lost = tuple(name for name, there in zip(names, closed, strict=True) if not there)
     off = np.abs(z - target)
@@ -253,8 +254,8 @@ def _expected(prediction: Result, names: tuple[str, ...]) -> Course:
     phases = []
     for phase, at in zip(prediction.phases, trajectory(prediction, SAMPLES), strict=False):
         cn, ct = np.zeros((2, SAMPLES, len(names)))
-        columns = [names.index(name) for name in phase.contacts]
-        cn[:, columns], ct[:, columns] = at.cn, at.ct
+        columns = [names.index(pair_name(name)) for name in phase.contacts]
+        cn[:, columns], ct[:, columns] = at.cn[:, : len(columns)], at.ct[:, : len(columns)]
         time, z, z_dot = (np.asarray(a) for a in (at.time, at.z, at.z_dot))
         phases.append(Course(time, z, z_dot, cn, ct, touching(prediction.scene, names, z)))
     return Course(*(np.concatenate(field) for field in zip(*phases, strict=True)))

@@ -39,7 +39,7 @@ def execute(
     shares = _share("--friction", friction), _share("--mass", mass)
     loaded = scene_of(scene, None)
     try:
-        from wholearm_jax.execution import Ending, Tolerance
+        from wholearm_jax.execution import Ending, Tolerance, require_wires
         from wholearm_jax.execution import execute as drive
         from wholearm_jax.perturbation import Amounts
         from wholearm_jax.perturbation import perturb as drive_perturbed
@@ -55,9 +55,10 @@ def execute(
     within = Tolerance(position, angle)
     print(f"predicted: {prediction.message}")
     try:
-        done = drive(prediction, timestep=timestep, tolerance=within)
+        require_wires(prediction)
     except ValueError:
         sys.exit(1)  # no wire, no end to arrive at; the line above says why
+    done = drive(prediction, timestep=timestep, tolerance=within)
     for contact, made, expected, executed in done.events:
         times = " predicted, ".join("never" if t is None else f"{t:.4f} s" for t in (expected, executed))
         print(f"{contact} {'made' if made else 'opened'}: {times} executed")

@@ -16,7 +16,7 @@ from matplotlib.patches import Polygon as Patch
 from wholearm_jax.drawing import INK, PAGE, PALE, draw_pose, outline_at, over_time, pose_grid
 from wholearm_jax.palette import CONTACT_COLOURS, contact_styles
 from wholearm_jax.palette import LINK_COLOURS as COLOURS
-from wholearm_jax.scene import body
+from wholearm_jax.scene import body, pair_name
 
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
     from wholearm_jax.execution import Execution
@@ -145,7 +145,7 @@ def _spans(times, flags):
 
 def _colour(execution: Execution, name: str) -> str:
     """The colour of a contact of the plan."""
-    styles = contact_styles(phase.contacts for phase in execution.prediction.phases)
+    styles = contact_styles(map(pair_name, phase.contacts) for phase in execution.prediction.phases)
     return CONTACT_COLOURS[styles[name][0]]
 
 

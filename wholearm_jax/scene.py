@@ -199,6 +199,11 @@ def parse_contact(text: str) -> tuple[int, int, int, bool]:
     return LINKS.index(link), VERTEX if letter == "v" else EDGE, int(number), rolling is not None
 
 
+def pair_name(contact: str) -> str:
+    """The two features of a contact, whether it slides or rolls: `palm:v6` of `palm:v6 rolling`."""
+    return contact.partition(" ")[0]
+
+
 def contact_name(link: int, kind: int, feature: int, *, rolling: bool = False) -> str:
     """The inverse of `parse_contact`."""
     return f"{LINKS[link]}:{'v' if kind == VERTEX else 'e'}{feature}" + (" rolling" if rolling else "")
