@@ -117,15 +117,14 @@ def _solve(linear: Linear, stiff, aim, damping):
 
     `damping` is a price of the step's size: it keeps steps small along ways that the loss hardly sees.
     """
-    bears, across = linear.bears, jnp.where(linear.still | linear.loose[:, None], 0.0, linear.across)
+    bears, across = linear.bears, jnp.where(linear.still, 0.0, linear.across)
     e, n = across.shape
     lean = gather(linear, stiff * bears)
     matrix = jnp.zeros((n + 1 + e, n + 1 + e))
     matrix = matrix.at[:n, :n].set(metric(linear, stiff) + damping * jnp.eye(n)).at[n, n].set((stiff * bears).sum())
     matrix = matrix.at[:n, n].set(-lean).at[n, :n].set(-lean)
     matrix = matrix.at[:n, n + 1 :].set(across.T).at[n + 1 :, :n].set(across)
-    matrix = matrix.at[n + 1 :, n + 1 :].set(-jnp.diag(1.0 * linear.loose))
-    right = [gather(linear, aim), (1 - (bears * aim).sum())[None], jnp.where(linear.loose, 0.0, -linear.defect)]
+    right = [gather(linear, aim), (1 - (bears * aim).sum())[None], -linear.defect]
     step = jnp.linalg.solve(matrix, jnp.concatenate(right))
     return step[:n], step[n], step[n + 1 :]
 
@@ -286,7 +285,7 @@ def merit(linear: Linear, hot, joining) -> Float[Array, ""]:
 
 
 def _apart(linear: Linear):
-    return jnp.where(linear.loose, 0.0, jnp.abs(linear.defect)).sum()
+    return jnp.abs(linear.defect).sum()
 
 
 @Program

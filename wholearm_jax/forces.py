@@ -192,6 +192,9 @@ def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion
     margin = margin + slope * shift + stop_gradient(curve) * shift**2 / 2
     margin = jnp.where(arc.live & ~arc.held, margin, jnp.inf)
     lost, lost_contact = _first_loss(*stop_gradient((table, seen, duration, steps)), values)
+    between = (margin < 0) & ~jnp.isfinite(lost)  # a dip that no sample shows
+    lost = jnp.where(between, stop_gradient(share), lost)
+    lost_contact = jnp.where(between, contact, lost_contact)
     return Score(margin, share, s, contact, lost, lost_contact)
 
 

@@ -9,7 +9,7 @@ import jax
 from jaxtyping import Array, Float
 
 from wholearm_jax.phase import Traced
-from wholearm_jax.plan import least, outcomes, steps_within, trace
+from wholearm_jax.plan import least, outcomes, roomy, steps_within, trace
 from wholearm_jax.precision import require_x64
 from wholearm_jax.scene import Scene
 from wholearm_jax.schedule import Torque
@@ -33,7 +33,8 @@ def torque_gradient(
     """
     require_x64()
     how = Integration(tolerance=tolerance, adjoint=mode(torque), steps=steps_within(scene, torque))
-    return _gradient(scene, torque, traced or trace(scene), tolerance_as_data(how, torque.times.dtype))
+    how = tolerance_as_data(roomy(how, scene, torque), torque.times.dtype)
+    return _gradient(scene, torque, traced or trace(scene), how)
 
 
 def mode(torque: Torque) -> str:

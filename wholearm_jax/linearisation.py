@@ -46,14 +46,13 @@ class Rooms(NamedTuple):
 
 class Linear(NamedTuple):
     """All intervals at `p` with derivatives: `at` and `rates` (last axis: an interval's seven numbers), what must
-    vanish, `defect`, and its derivatives `across`; `loose` marks rows of them that do not bind, `bears` the rooms that
-    the margin lowers, `still` the variables that stay."""
+    vanish, `defect`, and its derivatives `across`; `bears` marks the rooms that the margin lowers, `still` the
+    variables that stay."""
 
     at: Rooms
     rates: Rooms
     defect: Float[Array, "e"]
     across: Float[Array, "e p"]
-    loose: Bool[Array, "e"]
     bears: Float[Array, "rooms"]
     still: Bool[Array, "p"]
 
@@ -102,31 +101,32 @@ def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> 
     flat, unravel = ravel_pytree(p)
 
     def seams(x):
-        return _seams(unravel(x), tables, limits)
+        return _seams(unravel(x), tables)
 
-    loose = jnp.concatenate([jnp.zeros(defect.size, bool), _loose_seams(phases, limits)])
     bears = np.arange(at.room.shape[2]) < PARTS * STEPS * SAMPLES * ROWS
     return Linear(
         at,
         rates,
         jnp.concatenate([defect, seams(flat)]),
         jnp.concatenate([across, jax.jacfwd(seams)(flat)]),
-        loose,
         jnp.asarray(bears * 1.0),
         _still(limits, phases, knots),
     )
 
 
-def _seams(p: Variables, tables: Table, limits: Limits) -> Float[Array, "seams"]:
-    """What must vanish where one phase takes over from another at speed: the error of the speed after the impact, and,
-    where torque rates are limited, the torques' steps."""
+def _seams(p: Variables, tables: Table) -> Float[Array, "seams"]:
+    """What must vanish where one phase takes over from another at speed: the error of the speed after the impact, and
+    the torques' steps.
+
+    A step placed on the moment of the change would act in the wrong formation whenever the object is early or late,
+    be it by rounding: the margin would jump with the torques.
+    """
     if p.torque.shape[0] == 1:
         return jnp.zeros(0)
     before, after = (jax.tree.map(lambda a, k=k: a[k], tables) for k in (slice(0, -1), slice(1, None)))
     speed = before.length / jnp.exp(p.log_duration[:-1]) * p.state[:-1, -1, 1]
     lost = p.state[1:, 0, 1] - passed_on(before, after) * speed * jnp.exp(p.log_duration[1:]) / after.length
-    jump = (p.torque[1:, 0] - p.torque[:-1, -1]) * jnp.isfinite(limits.rate)
-    return jnp.concatenate([lost, jump.ravel()])
+    return jnp.concatenate([lost, (p.torque[1:, 0] - p.torque[:-1, -1]).ravel()])
 
 
 def passed_on(before: Table, after: Table) -> Float[Array, "seams"]:
@@ -137,11 +137,6 @@ def passed_on(before: Table, after: Table) -> Float[Array, "seams"]:
         return change(after, on_panel(before.velocity, panel, xi)).speed
 
     return jax.vmap(one)(before, after)
-
-
-def _loose_seams(phases: int, limits: Limits) -> Bool[Array, "seams"]:
-    free = jnp.tile(~jnp.isfinite(limits.rate), phases - 1)
-    return jnp.concatenate([jnp.zeros(phases - 1, bool), free])
 
 
 def _columns(phases: int, knots: int) -> tuple[Int[np.ndarray, "phases intervals 7"], Int[np.ndarray, "..."]]:

@@ -90,7 +90,7 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
 
 def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...]:
     """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.bound`), or
-    that of the statics for a phase that holds the object.
+    that of the statics for a phase that holds the object; `-inf` for a wire that could not be traced.
 
     Derivation, section 8: a tuple of `Bound`, one a phase, with `value` [N], and `s` and `share` of the wire where
     it is tight.
@@ -103,11 +103,10 @@ def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...
     rows = zip(traced, scene.phases, begins, strict=True)
 
     def top(at, phase, begin):
+        if int(at.table.status) != Status.OK:
+            return Bound(jnp.asarray(-np.inf), at.table.breaks[0], jnp.zeros(()))
         if phase.arrive != "hold":
             return _bound(at.table, phase.duration, array(begin), array(phase.arrive == "rest"))
-        known = int(at.table.status) == Status.OK
-        if not known:
-            return Bound(jnp.asarray(-np.inf), at.table.breaks[0], jnp.zeros(()))
         balance, departure = balance_at_start(scene, phase, at)
         return Bound(jnp.asarray(balance.best(departure).margin), at.table.breaks[0], jnp.zeros(()))
 
@@ -141,7 +140,8 @@ def optimise(
     that holds the object keeps its duration and gets the best torque of its statics, approached and left as fast as
     `rate_limit` allows. Where no torque can hold a formation, nothing is searched and the status says so.
 
-    Derivation, section 9. Raises RuntimeError without float64, ValueError for a `rate_limit` that is not positive.
+    Derivation, section 9. Raises RuntimeError without float64, ValueError for a `rate_limit` that is not positive,
+    or `durations` that are not.
 
     >>> found = wa.optimise(wa.load("heptagon"))
     >>> found.result.status.label, [f"{share:.2f}" for share in found.reached]
@@ -150,6 +150,10 @@ def optimise(
     require_x64()
     if rate_limit is not None and not rate_limit > 0:
         raise ValueError("rate_limit must be positive")
+    if durations is not None and not 0 < durations[0] <= durations[1]:
+        raise ValueError("durations are (shortest, longest), positive and in this order")
+    if durations is not None and durations[0] == durations[1]:
+        scene, durations = _lasting(scene, durations[0]), None
     ready = compile_ahead(scene, knots=knots, optimiser=optimiser)
     traced = traced or trace(scene)
     tops = bounds(scene, traced=traced)
@@ -200,8 +204,19 @@ def _attempt(scene: Scene, traced, tops, wanted: _Wanted, lead: float) -> Optimi
     phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, lengths, strict=True))
     scene = eqx.tree_at(lambda s: s.phases, scene, phases)
     torque = _in_turn(found)
-    result = describe(scene, torque, traced, outcomes(scene, torque, traced, Integration()))
+    result = describe(scene, torque, traced, outcomes(scene, torque, traced, _accurately(wanted.knots)))
     return Optimised(scene, torque, result, tops, tuple(stopped), tuple(history))
+
+
+def _lasting(scene: Scene, duration: float) -> Scene:
+    """The same plan, but for the duration of all phases that move the object."""
+    phases = (p if p.arrive == "hold" else replace_duration(p, duration) for p in scene.phases)
+    return eqx.tree_at(lambda s: s.phases, scene, tuple(phases))
+
+
+def _accurately(knots: int) -> Integration:
+    """How schedules with so many knots a phase are simulated."""
+    return Integration(max_steps=rounded(2 * knots, Integration().max_steps))
 
 
 def compile_ahead(
@@ -333,7 +348,7 @@ def _compile(phases: int, knots: int, rows: int, method) -> None:
     p = Variables(*(array(a) for a in empty))
     advance(begin(p, method), tables, limits, HOW, method)
     zero, one = array(0.0), array(1.0)
-    run(table, padded(evenly(1.0, empty[0][0]), rows), zero, one, Integration(), "rest")
+    run(table, padded(evenly(1.0, empty[0][0]), rows), zero, one, _accurately(knots), "rest")
 
 
 @functools.cache
@@ -365,7 +380,7 @@ def _honest(scene: Scene, task: _Task, p: Variables) -> tuple[bool, float]:
     schedule = padded(torque, task.wanted.rows)
     ends = np.cumsum(np.exp(np.asarray(p.log_duration)) + task.lead)
     for phase, at, end, top in zip(task.phases, task.traced, ends, task.bounds, strict=True):
-        one = run(at.table, schedule, start, end - start, Integration(), phase.arrive, arriving)
+        one = run(at.table, schedule, start, end - start, _accurately(task.wanted.knots), phase.arrive, arriving)
         start += float(one.duration) * float(np.asarray(one.motion.share)[int(one.motion.count)])
         arriving = one.leaving if phase.arrive == "moving" else None
         held = stays(scene, torque, phase, at, one)

@@ -5,6 +5,7 @@ Two compiled programs serve every phase of every scene: `prepare` (trace and red
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,7 @@ from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Change, Table, change, on_panel, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, contact_name
 from wholearm_jax.schedule import Torque, window
+from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration, tolerance_as_data
 from wholearm_jax.system import system
 from wholearm_jax.verdict import ARRIVAL, GOALS, Verdict, judge
@@ -77,6 +79,8 @@ def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integra
     entered = change(table, arriving)
     motion = move(table, seen, duration, how=how, speed=jnp.maximum(entered.speed, 0.0))
     scored = score(table, seen, duration, motion, how)
+    whole = (table.status == int(Status.OK)) & (motion.status != int(Status.MAX_STEPS))  # of a part nothing is known
+    scored = eqx.tree_at(lambda one: one.margin, scored, jnp.where(whole, scored.margin, -jnp.inf))
     verdict = judge(table, motion, scored, goal, entered, arrival)
     last = jnp.maximum(motion.count - 1, 0)
     panel, xi = powers(table, motion.piece[last], motion.s[motion.count])

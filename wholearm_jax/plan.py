@@ -19,13 +19,14 @@ from wholearm_jax.precision import array, digits, require_x64
 from wholearm_jax.programs import transformed
 from wholearm_jax.result import Result, describe
 from wholearm_jax.scene import Body, Phase, Scene, body
-from wholearm_jax.schedule import Torque, has_steps, padded
+from wholearm_jax.schedule import Torque, has_steps, padded, rounded
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration, tolerance_as_data
 from wholearm_jax.verdict import ARRIVAL, GOALS
 from wholearm_jax.wire import Resolution
 
 ROUNDING = 1e4  # of a precision's last digit, the interpolation error that more panels do not make smaller
+NOWHERE = 1e-9  # length [object radii] of a wire that ends where it begins
 CONTINUITY = 1e-6  # metres and radians by which a phase may begin beside the end of the one before it
 
 
@@ -52,7 +53,7 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
         if phase.arrive == "hold" and int(traced.table.status) != Status.OK:
             other = eqx.tree_at(lambda p: p.heading.sign, phase, -phase.heading.sign)
             traced = _refined(solid, scene, other, rough, resolution, tolerance)
-        found.append(joined(traced, rough) if found else traced)
+        found.append(joined(traced, rough, array(not found), array(phase.arrive == "hold")))
         rough = destination(phase, traced)
     return tuple(found)
 
@@ -78,7 +79,7 @@ def trace_next(scene: Scene, solid: Body, resolution: Resolution, at, phase):
     """Trace the next phase of a plan, from where the one before it ended: one step of a scan."""
     (rough, first), (formation, heading, holds) = at, phase
     alone = prepare(solid, scene.hand, scene.gravity, formation, rough, heading, resolution)
-    traced = jax.tree.map(lambda a, b: jnp.where(first, a, b), alone, joined(alone, rough))
+    traced = joined(alone, rough, first, holds)
     ends = jnp.where(holds, start_configuration(traced.table), end_configuration(traced))
     return (ends, jnp.asarray(False)), traced
 
@@ -94,12 +95,16 @@ def _apart(together, count: int) -> tuple:
 
 
 @jax.jit
-def joined(traced: Traced, rough) -> Traced:
-    """Refuse a phase whose formation does not hold where the phase before it ended."""
+def joined(traced: Traced, rough, first, holds) -> Traced:
+    """Refuse a phase whose formation does not hold where the phase before it ended, or, unless it only `holds` the
+    object, whose wire ends where it begins."""
     apart = jnp.abs(start_configuration(traced.table) - rough).max()
     status = traced.table.status
-    open_there = (status == 0) & ~(apart < max(CONTINUITY, digits(apart, 5 / 8)))
-    return eqx.tree_at(lambda t: t.table.status, traced, jnp.where(open_there, int(Status.NO_CONVERGENCE), status))
+    known = status == int(Status.OK)
+    open_there = known & ~first & ~(apart < max(CONTINUITY, digits(apart, 5 / 8)))
+    nowhere = known & ~holds & (traced.table.length < NOWHERE)
+    status = jnp.where(open_there, int(Status.NO_CONVERGENCE), jnp.where(nowhere, int(Status.LEFT_FORMATION), status))
+    return eqx.tree_at(lambda t: t.table.status, traced, status)
 
 
 def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, tolerance: float) -> Traced:
@@ -197,13 +202,18 @@ def margin(
     >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")
     0.70 N
     """
-    how = replace(how, steps=how.steps or steps_within(scene, torque))
+    how = replace(roomy(how, scene, torque), steps=how.steps or steps_within(scene, torque))
     return least(scene, outcomes(scene, torque, trace(scene, resolution=resolution), how))
 
 
 def least(scene: Scene, found: tuple[Outcome, ...]) -> Float[Array, ""]:
-    """The least margin [N] of simulated phases, those that hold left out; `-inf` where one has no motion to score."""
+    """The least margin [N] of simulated phases, those that hold left out; `-inf` where one has no motion to score.
+
+    Raises ValueError for a plan that only holds its object.
+    """
     moving = [o.score.margin for o, p in zip(found, scene.phases, strict=True) if p.arrive != "hold"]
+    if not moving:
+        raise ValueError("a plan that only holds its object has no margin of a motion, see Result.hold_margin")
     return jnp.stack([jnp.where(jnp.isfinite(m), m, -jnp.inf) for m in moving]).min()
 
 
@@ -252,11 +262,24 @@ def simulate(
     stepped = steps_within(scene, torque)
     while True:
         how = Integration(tolerance=tolerance, max_steps=max_steps, stages=max(8, max_steps // 32), steps=stepped)
+        how = roomy(how, scene, torque)
         found = outcomes(scene, torque, traced, how, arrival)
         short = any(int(o.verdict.status) == Status.MAX_STEPS for o in found)
         if not short or max_steps >= 16384:
             return describe(scene, torque, traced, found)
         max_steps *= 4
+
+
+def roomy(how: Integration, scene: Scene, torque: Torque) -> Integration:
+    """The same integration with room for a step at every row of a schedule, and for as many more as it has.
+
+    Counted are the rows within a phase, or all where times or durations are being transformed.
+    """
+    rows = torque.times.shape[0]
+    if not transformed(torque.times, [phase.duration for phase in scene.phases]):
+        ends = np.cumsum([0.0, *(float(phase.duration) for phase in scene.phases)])
+        rows = int(np.max(np.diff(np.searchsorted(np.asarray(torque.times), ends))))
+    return replace(how, max_steps=max(how.max_steps, rounded(2 * rows, how.max_steps)))
 
 
 def steps_within(scenes: Scene, torque: Torque) -> bool:

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from wholearm_jax.forces import smooth_margin
 from wholearm_jax.optimiser import optimise
 from wholearm_jax.phase import Traced
-from wholearm_jax.plan import outcomes, steps_within, trace
+from wholearm_jax.plan import outcomes, require_motion, roomy, steps_within, trace
 from wholearm_jax.programs import Program
 from wholearm_jax.schedule import Torque
 from wholearm_jax.status import Status
@@ -71,12 +71,13 @@ def optimise_robustly(
     """Maximise the margin at a low `quantile` (0: the worst) over the first `samples` scenes of an ensemble.
 
     `rate` is the step of Adam as a share of the torque limits. `nominal` starts from another schedule than
-    `optimise(ensemble.scene)` finds.
+    `optimise(ensemble.scene)` finds. Raises ValueError for a plan that holds its object in a phase.
     """
     scene = ensemble.scene
+    require_motion(scene)
     start = optimise(scene, knots=knots).torque if nominal is None else nominal
     seen, unseen = (_traced(ensemble, jnp.arange(samples) + first) for first in (0, samples))
-    how = replace(HOW, steps=steps_within(scene, start))
+    how = replace(roomy(HOW, scene, start), steps=steps_within(scene, start))
 
     def tried(torque: Torque, traced) -> _Climbed:
         return _climb(torque, scene, traced, jnp.asarray(arrival, float), how)
@@ -129,7 +130,8 @@ def _climb(torque: Torque, scene, traced, arrival, how: Integration) -> _Climbed
         def one(at):
             found = outcomes(scene, Torque(torque.times, values), at, how, arrival)
             least = jnp.stack([jnp.where(jnp.isfinite(o.score.margin), o.score.margin, NONE) for o in found]).min()
-            missed = jnp.stack([_missed(o, t.table, arrival) for o, t in zip(found, at, strict=True)]).sum()
+            ends = zip(scene.phases, found, at, strict=True)
+            missed = jnp.stack([_missed(o, t.table, p.arrive, arrival) for p, o, t in ends]).sum()
             holds = jnp.stack([o.verdict.status == int(Status.OK) for o in found]).all()
             return least, missed, holds
 
@@ -143,9 +145,10 @@ def _climb(torque: Torque, scene, traced, arrival, how: Integration) -> _Climbed
     return _Climbed(margins, holds, slope)
 
 
-def _missed(outcome, table, arrival):
+def _missed(outcome, table, arrive: str, arrival):
     """How far beyond the tolerance a phase ends from where it should: a logarithm, lest the worst sample rule all."""
     at = outcome.motion.count
-    place = jnp.abs(table.breaks[-1] - outcome.motion.s[at]) / table.length / arrival
-    speed = outcome.motion.w[at] / table.length / jnp.sqrt(BRAKING * arrival)
-    return jnp.log1p(jnp.maximum(place - WITHIN, 0.0) ** 2) + jnp.log1p(jnp.maximum(speed - WITHIN, 0.0) ** 2)
+    off = [jnp.abs(table.breaks[-1] - outcome.motion.s[at]) / table.length / arrival]
+    if arrive == "rest":
+        off.append(outcome.motion.w[at] / table.length / jnp.sqrt(BRAKING * arrival))
+    return sum(jnp.log1p(jnp.maximum(one - WITHIN, 0.0) ** 2) for one in off)

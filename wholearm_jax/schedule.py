@@ -14,6 +14,9 @@ from wholearm_jax.precision import array
 ROWS = 128  # schedules are padded to a multiple of this: those of like length share compiled programs
 
 
+ROUNDING = 16  # times beside each other by this many of a precision's last digits are one
+
+
 class Torque(eqx.Module):
     """A torque schedule: `times` [s], non-decreasing, and `values` [N m], one row `(tau1, tau2)` a time.
 
@@ -87,14 +90,16 @@ def padded(schedule: Torque, multiple: int = ROWS) -> Torque:
 
 
 def window(schedule: Torque, start: Float[Array, ""], duration: Float[Array, ""]) -> Window:
-    """A schedule over one phase."""
+    """A schedule over one phase. Rows at its start or end but for rounding count as there: the times of phases are
+    sums, and those of a file are rounded, so that a step between two phases would else be taken within one."""
     times = schedule.times
     gap = jnp.diff(times)
     rise = jnp.diff(schedule.values, axis=0)
     slope = jnp.where((gap > 0)[:, None], rise / jnp.where(gap > 0, gap, 1.0)[:, None], 0.0) * duration
     intervals = times.shape[0] - 1
-    first = jnp.searchsorted(times, start, side="right") - 1
-    last = jnp.searchsorted(times, start + duration, side="left") - 1
+    near = ROUNDING * jnp.finfo(times.dtype).eps * (jnp.abs(start) + duration)
+    first = jnp.searchsorted(times, start + near, side="right") - 1
+    last = jnp.searchsorted(times, start + duration - near, side="left") - 1
     first = jnp.clip(first, 0, intervals - 1)
     return Window(
         share=(times - start) / duration,
