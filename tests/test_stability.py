@@ -206,9 +206,11 @@ def test_a_step_as_short_as_rounding_keeps_its_speed():
     np.testing.assert_allclose(speed, 1.5, rtol=1e-12)
 
 
-def test_a_dip_between_samples_is_found_among_many_low_steps():
-    """One piece of many has a force that falls from above all others' to far below them within a third of a step."""
-    count, deep, floor = 2 * REFINED, REFINED + 1, 0.3
+@pytest.mark.parametrize("floor", [0.3, -1e-3])
+def test_a_dip_between_samples_is_found_among_many_low_steps(floor):
+    """One piece of many has a force that falls from above all others' to far below them within a third of a step, or
+    below zero for less than any sample shows."""
+    count, deep = 2 * REFINED, REFINED + 1
     table, seen = track(np.append(np.arange(count), 99.0), np.ones(count))
     motion = move(table, seen, jnp.asarray(1.0), how=Integration(), speed=float(count - 1))
     places = np.asarray(motion.s)[: int(motion.count) + 1]
@@ -224,6 +226,8 @@ def test_a_dip_between_samples_is_found_among_many_low_steps():
     assert float(found.margin) == pytest.approx(floor, abs=1e-9)
     assert int(found.contact) == 2
     assert float(found.s) == pytest.approx(deep + (lowest + 1) / 2, abs=1e-6)
+    assert float(found.lost) == (float(found.share) if floor < 0 else np.inf)
+    assert floor > 0 or int(found.lost_contact) == 2
 
 
 def test_what_passes_and_comes_back_within_a_step_is_met_on_its_way_down():

@@ -1,0 +1,100 @@
+"""What a margin is of, and when: many rows, rounded times, dips between samples, wires and plans that have none."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.plan import least, outcomes
+from wholearm_jax.scene import replace_duration
+from wholearm_jax.scene_file import to_dict
+from wholearm_jax.stepping import Integration
+
+
+@pytest.fixture(scope="module")
+def heptagon():
+    scene = wa.load("heptagon")
+    return scene, wa.quasistatic(scene)
+
+
+def finer(torque, rows):
+    """The same schedule of two phases with so many rows a phase."""
+    times, values = np.asarray(torque.times), np.asarray(torque.values)
+    half = len(times) // 2
+    fine = [np.linspace(times[k], times[k + half - 1], rows) for k in (0, half)]
+    interpolated = [
+        np.stack([np.interp(t, times[k : k + half], values[k : k + half, joint]) for joint in range(2)], axis=1)
+        for k, t in zip((0, half), fine, strict=True)
+    ]
+    return wa.torque(np.concatenate(fine), np.vstack(interpolated))
+
+
+def test_a_margin_is_of_the_whole_motion_however_many_rows_a_schedule_has(heptagon):
+    """Steps end on rows: 501 a phase need more steps than a phase of 51."""
+    scene, torque = heptagon
+    many = finer(torque, 501)
+    wanted = float(wa.margin(scene, torque))
+    assert wa.simulate(scene, many).margin == pytest.approx(wanted, rel=1e-9)
+    assert float(wa.margin(scene, many)) == pytest.approx(wanted, rel=1e-9)
+
+
+def test_a_part_of_a_motion_has_no_margin(heptagon):
+    scene, torque = heptagon
+    short = outcomes(scene, torque, wa.trace(scene), Integration(max_steps=16))
+    assert wa.Status(int(short[0].verdict.status)) is wa.Status.MAX_STEPS
+    assert float(least(scene, short)) == -np.inf
+
+
+def test_optimise_takes_as_many_knots_as_it_is_told(heptagon):
+    scene, _ = heptagon
+    slide = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
+    found = wa.optimise(slide, knots=271, steps=40)
+    assert found.result.status is wa.Status.OK, found.result.message
+
+
+@pytest.mark.parametrize("digits", [9, 12])
+def test_a_step_of_torque_between_phases_may_stand_beside_their_seam_by_rounding(heptagon, digits):
+    """1.1 + 2.2 is not 3.3: who writes times with a few digits means the same plan."""
+    scene, _ = heptagon
+    phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, (0.1 + 0.2, 0.6 + 0.7), strict=True))
+    plan = eqx.tree_at(lambda s: s.phases, scene, phases)
+    found = wa.optimise(plan)
+    rounded = wa.torque(np.round(np.asarray(found.torque.times), digits), found.torque.values)
+    assert not np.array_equal(rounded.times, found.torque.times)
+    again = wa.simulate(plan, rounded)
+    assert again.status is wa.Status.OK, again.message
+    assert again.margin == pytest.approx(found.result.margin, rel=1e-6)
+
+
+def test_durations_that_are_one_are_kept_and_those_in_no_order_refused(heptagon):
+    scene, _ = heptagon
+    slide = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
+    found = wa.optimise(slide, durations=(0.5, 0.5))
+    assert float(found.scene.phases[0].duration) == 0.5
+    assert float(found.torque.times[-1]) == pytest.approx(0.5)
+    with pytest.raises(ValueError, match="shortest, longest"):
+        wa.optimise(slide, durations=(2.0, 0.5))
+
+
+def test_a_wire_that_ends_where_it_begins_is_none(heptagon):
+    """The usual slip of a pen: the next phase told to go back through what the object has just come up against."""
+    scene, torque = heptagon
+    data = to_dict(scene)
+    slide, flip = data["phase"]
+    back = wa.parse(data | {"phase": [slide, flip | {"toward": "phi+"}]})
+    traced = wa.trace(back)
+    assert wa.Status(int(traced[1].table.status)) is wa.Status.LEFT_FORMATION
+    assert float(wa.margin(back, torque)) == -np.inf
+    assert float(wa.bounds(back, traced=traced)[1].value) == -np.inf
+    found = wa.optimise(back, traced=traced)
+    assert found.stopped[1] == "the wire cannot be followed: left_formation"
+    assert len({step.phase for step in found.history}) == 1
+
+
+def test_a_plan_that_only_holds_its_object_has_no_margin_of_a_motion(heptagon):
+    data = to_dict(heptagon[0])
+    hold = {"name": "hold", "contacts": data["phase"][0]["contacts"], "hold": True, "duration": 1.0}
+    plan = wa.parse(data | {"phase": [hold]})
+    with pytest.raises(ValueError, match="only holds its object"):
+        wa.margin(plan, wa.torque([0.0, 1.0], jnp.zeros((2, 2))))
