@@ -3,6 +3,7 @@
 What takes long to import is imported where it is used: a command that needs none of it starts at once.
 """
 
+import sys
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -93,13 +94,48 @@ def traced_or_refused(name: str, scene):
                 raise BadInput(f"{name}: {key}: {which} cannot stay in its place {where}: it is off by {size:.3g} m")
             raise BadInput(f"{name}: {key}: {which} cannot touch {where}: a gap of {size:.3g} m stays open")
         break  # what follows a wire that cannot be followed has no start
+    _note_unreached(name, scene, traced)
     return traced
+
+
+def _note_unreached(name: str, scene, traced) -> None:
+    """Say where a phase ends before its `until`."""
+    from wholearm_jax.phase import end_configuration, start_configuration
+    from wholearm_jax.scene import COORDINATES
+    from wholearm_jax.wire import UNTIL
+
+    for k, (phase, at) in enumerate(zip(scene.phases, traced, strict=True)):
+        which = int(phase.heading.until_coordinate)
+        if which >= 0 and int(at.table.status) == 0 and int(at.wire.end_why) != UNTIL:
+            begin, end = (float(z[which]) for z in (start_configuration(at.table), end_configuration(at)))
+            wanted = f"{COORDINATES[which]} = {float(phase.heading.until_value):.6g}"
+            note(f"{name}: phase[{k}].until: {wanted} is not on its wire, which leads from {begin:.6g} to {end:.6g}")
+
+
+def note(text: str) -> None:
+    """Tell what may not be what was meant."""
+    print(f"wholearm: note: {text}", file=sys.stderr)
+
+
+def note_limits(scene, schedule, torque: Path) -> None:
+    """Say where a schedule asks for more than a joint's torque limit."""
+    import numpy as np
+
+    times, values = np.asarray(schedule.times), np.abs(np.asarray(schedule.values))
+    for joint, limit in enumerate(np.asarray(scene.hand.torque_limit).tolist()):
+        worst = int(np.argmax(values[:, joint]))
+        if values[worst, joint] > limit * (1 + 1e-9):
+            size, when = values[worst, joint], times[worst]
+            note(
+                f"{torque}: |tau{joint + 1}| is {size:.4g} N m at t = {when:.4g} s, beyond the limit of {limit:.4g} N m"
+            )
 
 
 def predicted(scene, schedule, torque: Path, tolerance: float, traced):
     """Simulate a plan under a schedule; refuse one from the file `torque` that is too short."""
     from wholearm_jax.plan import simulate as follow
 
+    note_limits(scene, schedule, torque)
     try:
         return follow(scene, schedule, tolerance=tolerance, traced=traced)
     except ValueError as error:

@@ -42,11 +42,11 @@ from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
 from wholearm_jax.variation import Ensemble, stack
-from wholearm_jax.verdict import ARRIVAL
 from wholearm_jax.wire import Resolution
 
 BLOCK = 128  # scenes that one device takes at once
 CHUNK = 4096  # scenes whose results are kept together
+ARRIVAL = 0.01  # share of the wire: plans that vary cannot end where the one must that torques were made for
 EXACT = 1e-9  # tolerances below this begin at the full resolution
 
 
@@ -153,8 +153,10 @@ def check(
 
     `scenes` may differ in every number, in formations and in the number of vertices (see `variation.stack`).
     `tolerance` bounds the error of the margin [N]; below 1e-9 all is computed as by `simulate`. A phase arrives when
-    it ends within a share `arrival` of its wire's length of the end, at a speed that fits (`verdict.BRAKING`). Memory
-    is that of `chunk` scenes beside the result. Never raises for a scene that fails: that is a status. Raises
+    it ends within a share `arrival` of its wire's length of the end (1e-6 for a plan that does not vary, by
+    `simulate`), at a speed that fits (`verdict.BRAKING`). Memory
+    is that of `chunk` scenes beside the result. Returns `Checked`: status, margin, time, contact, phase and end pose of
+    each scene. Never raises for a scene that fails: that is a status. Raises
     ValueError for a schedule shorter than a plan.
     """
     source = scenes if isinstance(scenes, Ensemble) else Given(scenes if isinstance(scenes, Scene) else stack(scenes))

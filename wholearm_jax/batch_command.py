@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import typer
 
-from wholearm_jax.arguments import BadInput, SceneName, TorqueFile, writing
+from wholearm_jax.arguments import BadInput, SceneName, TorqueFile, note_limits, writing
 
 ARRIVAL = 0.01  # share of the wire: perturbed plans cannot end where an unperturbed one must
 Vary = Annotated[list[str] | None, typer.Option("--vary", help="QUANTITY=AMOUNT, e.g. vertices=0.0005, friction=20%.")]
@@ -42,7 +42,7 @@ def check(
     process: Annotated[int | None, typer.Option(min=0, help="Which of them this is, from 0.")] = None,
 ) -> None:
     """Check a schedule against many variants of a scene; the same command goes on with a store it left unfinished."""
-    if (polygons is None) == (count is None) or (polygons is not None and vary):
+    if (polygons is None) == (count is None) or (polygons is None) != bool(vary):
         raise BadInput("check: give either --count, with --vary QUANTITY=AMOUNT, or --polygons FILE.npz")
     _use_all_processors()
     place = _join(coordinator, processes, process)
@@ -61,6 +61,8 @@ def check(
         require_motion(loaded)
     except ValueError as error:
         raise BadInput(f"{scene}: {error}") from None
+    if process in (None, 0) and not optimise:
+        note_limits(loaded, schedule, torque)
     source = read_polygons(polygons, loaded) if polygons else ensemble(loaded, vary, seed)
     total = count if count is not None else int(source.scenes.object.mass.shape[0])  # pyright: ignore
     try:
@@ -122,7 +124,7 @@ class _Job:
 
 def optimise_robustly(varied, folder: Path | None, samples: int, knots: int, steps: int, arrival: float) -> None:
     """`wholearm optimise --robust`: write torque.csv, say how it does on seen and unseen scenes, and exit."""
-    from wholearm_jax.result_file import write_torque
+    from wholearm_jax.result_file import discard, write_torque
     from wholearm_jax.robust import optimise_robustly as find
 
     found = find(varied, samples=samples, knots=knots, steps=steps, arrival=arrival)
@@ -131,6 +133,7 @@ def optimise_robustly(varied, folder: Path | None, samples: int, knots: int, ste
         print(f"{samples} {name} scenes: nominal {next(told)}; robust {next(told)}")
     if folder is not None:
         with writing(f"--out {folder}"):
+            discard(folder)
             write_torque(found.torque, folder / "torque.csv")
     sys.exit(0 if found.unseen[1].share == 1.0 else 1)
 

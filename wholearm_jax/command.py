@@ -8,7 +8,7 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import typer
@@ -29,7 +29,9 @@ from wholearm_jax.execution_command import execute
 from wholearm_jax.programs import keep
 from wholearm_jax.settings import configure
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+UsageError: Any = typer.BadParameter.__mro__[1]  # of the library beneath, which Typer has under changing names
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 Out = Annotated[Path | None, typer.Option(help="Folder for torque.csv, trajectory.csv, summary.json and figures.")]
 Changes = Annotated[
@@ -52,7 +54,12 @@ def main() -> None:
     from wholearm_jax.scene_file import SceneError
 
     try:
-        app()
+        sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False) or 0)
+    except typer.Abort:
+        sys.exit(130)
+    except UsageError as error:
+        print(f"wholearm: {error.format_message()}", file=sys.stderr)
+        sys.exit(2)
     except (SceneError, BadInput) as error:
         print(f"wholearm: {error}", file=sys.stderr)
         sys.exit(2)
@@ -94,7 +101,8 @@ def optimise(
         int | None, typer.Option(min=2, help="Rows a phase in trajectory.csv (201), or samples.")
     ] = None,
     robust: Annotated[
-        list[str] | None, typer.Option(help="QUANTITY=AMOUNT: the best torques for --samples (64) varied scenes.")
+        list[str] | None,
+        typer.Option(help="QUANTITY=AMOUNT: the best torques for --samples (64) varied scenes; writes torque.csv."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the varied scenes.")] = 0,
     arrival: Annotated[float, typer.Option(min=1e-9, max=1.0, help="As of `check`, for --robust.")] = ARRIVAL,
@@ -106,7 +114,8 @@ def optimise(
     loaded = scene_of(scene, set_)
     folder = made_folder(out)
     if robust:
-        unknown = [name for name, value in (("rate-limit", rate_limit), ("passing", passing)) if value is not None]
+        others = (("rate-limit", rate_limit), ("passing", passing), ("report", report or None))
+        unknown = [name for name, value in others if value is not None]
         if unknown:
             raise BadInput(f"--robust: knows no --{unknown[0]}")
         optimise_robustly(ensemble(loaded, robust, seed), folder, samples or 64, knots, steps, arrival)
@@ -136,7 +145,8 @@ def optimise(
             progress.update(bar, completed=steps, state=why)
     seconds = time.perf_counter() - begun
     for phase, top, share, why in zip(found.result.phases, found.bounds, found.reached, found.stopped, strict=True):
-        reached = f", {100 * share:.1f} % of it reached" if 0 < share < float("inf") else ""
+        held = phase.status.value == 0 and 0 < share < float("inf")  # a plan that fails may not come to the hard part
+        reached = f", {100 * share:.1f} % of it reached" if held else ""
         print(f"{phase.message}; bound {float(top.value):.4g} N{reached}; stopped: {why}")
     more = {"command": "optimise", "knots": knots, "steps": len(found.history), "seconds": seconds}
     more |= {"rate_limit": rate_limit, "passing": passing, "stopped": list(found.stopped)}
@@ -165,14 +175,19 @@ def simulate(
     folder = made_folder(out)
     traced = traced_or_refused(scene, loaded)
     result = predicted(loaded, schedule, torque, tolerance, traced)
-    for phase in result.phases:
-        print(phase.message)
-        for held in phase.holds:
-            print(f"    {held.message}")
+    _tell(result)
     if check_gradient:
         _check_gradient(loaded, schedule)
     tops = tuple(float(b.value) for b in bounds(loaded, traced=traced))
     _finish(result, folder, samples, bounds=tops, command="simulate", torque=str(torque), tolerance=tolerance)
+
+
+def _tell(result) -> None:
+    """What became of every phase, a line each, and of every time that friction held the object."""
+    for phase in result.phases:
+        print(phase.message)
+        for held in phase.holds:
+            print(f"    {held.message}")
 
 
 def _check_gradient(scene, schedule) -> None:
@@ -194,6 +209,11 @@ def _check_gradient(scene, schedule) -> None:
         numbers = (f"{x:.10g}" for x in (one.forward, one.reverse, one.differences))
         table.add_row(one.group, f"{one.tolerance:.0e}", *numbers, f"{one.uncertainty:.0e}", one.finding)
     Console(width=120).print(table)
+
+
+LEGEND = """length: of the wire, in object radii; '-' and a status where none can be followed
+static, bound: the best least contact force [N] with the object at rest there, and in a phase of 1 s
+enter at speed: what an object that arrives at speed keeps of it; 'pulls': a contact would have to pull"""
 
 
 @app.command()
@@ -232,6 +252,7 @@ def formations(
         top = f"{way.bound:.3f}" if way.bound > float("-inf") else "-"
         table.add_row(" ".join(way.contacts), way.toward, way.ends, f"{way.length:.2f}", held, top, way.entering)
     Console().print(table)
+    print(LEGEND)
     if folder is not None:
         from wholearm_jax.drawing import draw_ways, save_figure
 
@@ -244,16 +265,18 @@ def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
     loaded = scene_of(scene, None)
     folder = made_folder(out)
     from wholearm_jax.baseline import search as look
+    from wholearm_jax.optimiser import bounds
 
-    traced_or_refused(scene, loaded)
+    traced = traced_or_refused(scene, loaded)
     try:
         found = look(loaded)
     except ValueError as error:
         raise BadInput(f"{scene}: {error}") from None
-    for phase in found.result.phases:
-        print(phase.message)
+    _tell(found.result)
     print(f"{found.simulations} simulations in {found.seconds:.2f} s")
-    _finish(found.result, folder, samples, command="search", simulations=found.simulations, seconds=found.seconds)
+    tops = tuple(float(b.value) for b in bounds(found.result.scene, traced=traced))
+    more = {"simulations": found.simulations, "seconds": found.seconds}
+    _finish(found.result, folder, samples, bounds=tops, command="search", **more)
 
 
 @app.command()
@@ -274,9 +297,10 @@ app.command()(execute)
 def _finish(result, folder: Path | None, samples: int, report: bool = False, **more) -> None:
     """Write the files, say what became of the plan, and exit with its status."""
     if folder is not None:
-        from wholearm_jax.result_file import summary, write_summary, write_torque, write_trajectory
+        from wholearm_jax.result_file import discard, summary, write_summary, write_torque, write_trajectory
 
         with writing(f"--out {folder}"):
+            discard(folder)
             write_torque(result.torque, folder / "torque.csv")
             write_trajectory(result, folder / "trajectory.csv", samples)
             write_summary(summary(result, **more), folder / "summary.json")

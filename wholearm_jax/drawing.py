@@ -170,10 +170,10 @@ def draw_forces(result: Result, ax: Axes | None = None, *, legend: bool = True) 
                 label = label and r"its $\mu c_n - |c_t|$"
                 ax.plot(course.time, slack, color=colour, ls=":", label=label)
     ax.set_ylabel("contact force $c_n$ [N]")
+    _draw_holds(result, ax)
     ax.autoscale(axis="y")  # with what other axes hold that share this one
     low, high = ax.get_ylim()
     ax.set_ylim(min(low, 0.0) - 0.14 * (high - min(low, 0.0)), high)
-    _draw_holds(result, ax)
     _mark_margin(result, ax)
     over_time(ax, result)
     return _legend(ax, 3) if legend else ax

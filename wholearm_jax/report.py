@@ -213,16 +213,18 @@ def _worst(rows) -> dict[str, Any] | None:
 
 
 def _reached(row) -> str:
-    """The share of its bound that a phase reached, in words."""
+    """The share of its bound that a phase reached, in words: one that fails may not have come to the hard part."""
     top, margin = row["bound"], row["margin"]
-    return f"{100 * margin / top:.1f} %" if top and margin is not None and margin > 0 and top > 0 else DASH
+    if row["status"] != Status.OK.label or not top or margin is None:
+        return DASH
+    return f"{100 * margin / top:.1f} %" if margin > 0 and top > 0 else DASH
 
 
 def _settings(summary: dict[str, Any]) -> dict[str, str]:
     """How the result was made: all that the summary says beside the result itself."""
     known = {"status", "margin", "message", "phases", "scene", "stopped"}
     named = {"seconds": "time taken [s]", "steps": "steps of descent", "rate_limit": "largest torque rate [N m/s]"}
-    named |= {"passing": "least speed at changes, over the mean"}
+    named |= {"passing": "least speed at changes, over the mean", "hold_margin": "margin of the holds [N]"}
     return {str(named.get(k, k)): _digits(v) for k, v in summary.items() if k not in known and v is not None}
 
 

@@ -165,6 +165,13 @@ def write_execution(execution: Execution, path: str | Path, samples: int = 201) 
     write_whole(path, _csv(header, table.tolist()))
 
 
+def discard(folder: Path) -> None:
+    """Remove what an earlier result left in a folder: files of two results beside each other would mislead."""
+    figures = (f"{name}.{kind}" for name in ("plan", "result") for kind in ("png", "svg", "pdf"))
+    for name in ("torque.csv", "trajectory.csv", "summary.json", "report.html", *figures):
+        (folder / name).unlink(missing_ok=True)
+
+
 def write_summary(content: dict[str, Any], path: str | Path) -> None:
     """Write a summary as JSON."""
     write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
