@@ -1,5 +1,6 @@
 """Many scenes at once: each is what it is alone, in a store that goes on where it was stopped."""
 
+import inspect
 import sys
 
 import equinox as eqx
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax import command
+from wholearm_jax import batch_command, command
 from wholearm_jax.batch import check_chunks, from_result
 from wholearm_jax.store import StoreError, identity, open_store
 from wholearm_jax.survey import influences, survey
@@ -150,7 +151,7 @@ def test_a_store_goes_on_and_ends_the_same(tmp_path, ensemble, schedule):
         ([], "--count"),
         (["--count", "4", "--vary", "colour=1"], "colour"),
         (["--polygons", "absent.npz"], "absent.npz"),
-        (["--count", "4", "--processes", "2"], "--coordinator"),
+        (["--count", "4", "--vary", "mass=1%", "--processes", "2"], "--coordinator"),
     ],
 )
 def test_bad_input_of_the_command(tmp_path, monkeypatch, capsys, arguments, said):
@@ -166,3 +167,8 @@ def test_bad_input_of_the_command(tmp_path, monkeypatch, capsys, arguments, said
     assert caught.value.code == 2
     assert err.count("\n") == 1
     assert said in err
+
+
+def test_scenes_that_vary_arrive_as_the_command_line_says():
+    """In Python as by `wholearm check`: near the end, as no varied plan ends where torques were not made for it."""
+    assert inspect.signature(wa.check).parameters["arrival"].default == batch_command.ARRIVAL

@@ -187,10 +187,25 @@ def test_contacts_that_cannot_all_touch(change, key, contact, cause, wholearm, z
     assert_bad_input(answer, f"{path}: {key}: {contact}", "cannot touch", cause, "stays open")
 
 
-@pytest.mark.parametrize("option", ["--rate-limit", "--passing"])
-def test_what_robust_does_not_know(option, wholearm):
-    answer = wholearm("optimise", "heptagon", "--robust", "friction=20%", option, "0.5")
-    assert_bad_input(answer, f"--robust: knows no {option}")
+@pytest.mark.parametrize("option", [("--rate-limit", 0.5), ("--passing", 0.5), ("--report",)])
+def test_what_robust_does_not_know(option, wholearm, tmp_path):
+    answer = wholearm("optimise", "heptagon", "--robust", "friction=20%", *option, "--out", tmp_path)
+    assert_bad_input(answer, f"--robust: knows no {option[0]}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "cause"),
+    [
+        (("optimise", "heptagon", "--knots", 2), "'--knots'"),
+        (("optimise", "heptagon", "--rate-limit", 0), "'--rate-limit'"),
+        (("simulate", "heptagon"), "'--torque'"),
+        (("optimise",), "'scene'"),
+        (("optimize", "heptagon"), "'optimize'"),
+        (("scenes", "--all"), "--all"),
+    ],
+)
+def test_wrong_arguments_are_one_line(arguments, cause, wholearm):
+    assert_bad_input(wholearm(*arguments), cause)
 
 
 @pytest.mark.parametrize("name", ["optimise", "search"])
@@ -208,6 +223,7 @@ def test_plan_that_fails(wholearm, zero, tmp_path):
     assert code == 1
     assert err == ""
     assert printed.startswith("slide left: stuck, t = 1 s")
+    assert "of it reached" not in printed
     assert {"torque.csv", "trajectory.csv", "summary.json", "plan.png", "result.svg"} <= set(os.listdir(out))
     assert not [name for name in os.listdir(out) if name.startswith(".")]
     content = json.loads((out / "summary.json").read_text())
@@ -224,3 +240,30 @@ def test_wire_that_cannot_be_followed(wholearm, zero, scene_file, tmp_path):
     assert err == ""
     assert printed.startswith("slide left: singular")
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["margin"] is None
+
+
+# --- what may not be meant -------------------------------------------------------------------------------------------
+
+
+def test_torques_beyond_a_limit_are_noted(wholearm, scene_file, tmp_path):
+    path, torque = scene_file(lambda data: data["hand"]["finger2"].update(torque_limit=0.25)), tmp_path / "much.csv"
+    torque.write_text("t,tau1,tau2\n0,0.3,0\n0.5,0.3,-0.4\n2,0.3,0\n")
+    _, _, err = wholearm("simulate", path, "--torque", torque)
+    assert err == f"wholearm: note: {torque}: |tau2| is 0.4 N m at t = 0.5 s, beyond the limit of 0.25 N m\n"
+
+
+def test_an_until_that_is_not_on_the_wire_is_noted(wholearm, zero, scene_file):
+    path = scene_file(lambda data: data["phase"][0].update(until={"x": 5.0}))
+    _, _, err = wholearm("simulate", path, "--torque", zero)
+    assert err.startswith(f"wholearm: note: {path}: phase[0].until: x = 5 is not on its wire, which leads from ")
+    path = scene_file(lambda data: data.update(phase=[data["phase"][0] | {"until": {"x": 0.01}}]))
+    assert wholearm("simulate", path, "--torque", zero)[2] == ""
+
+
+def test_nothing_of_an_earlier_result_stays_in_a_folder(wholearm, zero, tmp_path):
+    for name in ("report.html", "plan.png", "mine.txt"):
+        (tmp_path / name).write_text("of another time")
+    wholearm("simulate", "heptagon", "--torque", zero, "--out", tmp_path)
+    assert not (tmp_path / "report.html").exists()
+    assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "mine.txt").exists()
