@@ -34,6 +34,8 @@ def test_three_formations_without_a_stop(flown):
         mean = float(after.traced.table.length) / float(after.duration)
         assert float(after.outcome.entered.speed) > (PASSING - 1e-6) * mean, "at speed"
         assert min(after.impulses) > 0
+    times, values = np.asarray(flown.torque.times), np.asarray(flown.torque.values)
+    assert np.abs(np.diff(values, axis=0)[np.diff(times) == 0]).max() < 1e-9, "a step there would be on a knife's edge"
     for phase, top in zip(result.phases, flown.bounds, strict=True):
         assert 0 < phase.margin <= float(top.value) + 1e-9
 

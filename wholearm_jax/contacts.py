@@ -191,13 +191,16 @@ def slip_rows(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "contacts
     return _velocity_rows(several, at, _turned(at.normal))
 
 
-def rates(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]):
-    """How fast gaps open and places move `along` their features, where `z` moves at the rate `x`."""
+def gap_rates(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "contacts"]:
+    """How fast gaps open where `z` moves at the rate `x`: `G_n x`, without the rows."""
     at = frames(several, z)
-    return (
-        _velocities(several, at, at.normal, x),
-        _sense(several) * _velocities(several, at, _turned(at.normal), x),
-    )
+    return _velocities(several, at, at.normal, x)
+
+
+def along_rates(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "contacts"]:
+    """How fast places move `along` their features where `z` moves at the rate `x`."""
+    at = frames(several, z)
+    return _sense(several) * _velocities(several, at, _turned(at.normal), x)
 
 
 @jax.jit

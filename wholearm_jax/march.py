@@ -17,7 +17,15 @@ from jax.lax import stop_gradient
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.contacts import constraint_rates, constraint_rows, constraints, frames, rates, slips
+from wholearm_jax.contacts import (
+    along_rates,
+    constraint_rates,
+    constraint_rows,
+    constraints,
+    frames,
+    gap_rates,
+    slips,
+)
 from wholearm_jax.elimination import inverse, times
 from wholearm_jax.lookup import pick
 from wholearm_jax.precision import digits
@@ -117,15 +125,14 @@ def _watch(system, heading, sense, z, x, u) -> Watched:
     """What is watched at a place of the wire, and its rates in the chart with direction `u`."""
     pairs, held = frames(system.candidates, z), frames(system.contacts, z)
     slope = x / (u @ x)
-    opens, _ = rates(system.candidates, z, slope)
-    _, along = rates(system.contacts, z, slope)
+    along = along_rates(system.contacts, z, slope)
     coordinate = heading.until_coordinate
     ahead = jnp.where(coordinate < 0, 1.0, (heading.until_value - z[coordinate]) * sense)
     nears = jnp.where(coordinate < 0, 0.0, -slope[coordinate] * sense)
     room = [held.along - system.contacts.lower, system.contacts.upper - held.along]
     return Watched(
         values=jnp.concatenate([pairs.gap, *room, ahead[None]]),
-        rates=jnp.concatenate([opens, along, -along, nears[None]]),
+        rates=jnp.concatenate([gap_rates(system.candidates, z, slope), along, -along, nears[None]]),
         along=pairs.along,
     )
 

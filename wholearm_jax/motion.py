@@ -37,7 +37,7 @@ class Motion(eqx.Module):
 
     Step `i` lies in piece `piece[i]` and torque interval `row[i]`; `held[i]` marks waiting at rest. `share` is time in
     durations. Rows beyond `count` repeat the end. `status` is that of the end alone: `ok` (end of time while moving),
-    `left_formation` (the wire's end), `stuck`, `reversed`, `ambiguous` or `max_steps`.
+    `left_formation` (the wire's end), `stuck`, `reversed`, `ambiguous`, `no_convergence` (a landing) or `max_steps`.
     """
 
     share: Float[Array, "nodes"]

@@ -128,17 +128,18 @@ def optimise(
 ) -> Optimised:
     """Find the torque schedule with the largest compressive margin by gradient descent through the simulation.
 
-    Each phase must arrive at its planned end in time, at rest or, where the next takes over, `moving`; `knots` torques
-    a joint and phase, evenly spaced over the time for which it moves, are linear in between. The scene's torque limits
-    hold, and `rate_limit` [N m/s] if given: then torques do not step where phases change either, and an object may
-    wait, held by friction, for up to a quarter of a phase until the torque sets it out (`handover`). `durations =
-    (shortest, longest)` lets each phase choose its own. Formations that take over at speed are entered with at least
-    `passing` times their phase's mean speed (wire over duration): an object that hardly moves where its formation
-    changes may as well stop short of it. `optimiser` replaces the interior point by any optax optimiser
-    (`descent.projected`). A phase stops when its margin comes within `tolerance` of the bound or no longer improves by
-    that share, or after `steps`. `callback` sees every step; `traced` reuses the result of `trace`. A phase
-    that holds the object keeps its duration and gets the best torque of its statics, approached and left as fast as
-    `rate_limit` allows. Where no torque can hold a formation, nothing is searched and the status says so.
+    Each phase must arrive at its planned end in time, `moving` where the next takes over and else at rest, also where
+    the plan would allow any speed (`caught`, and a last phase that is `moving`); `knots` torques a joint and phase,
+    evenly spaced over the time for which it moves, are linear in between. The scene's torque limits hold, and
+    `rate_limit` [N m/s] if given: then torques do not step where phases change either, and an object may wait, held by
+    friction, for up to a quarter of a phase until the torque sets it out (`handover`). `durations = (shortest,
+    longest)` lets each phase choose its own. Formations that take over at speed are entered with at least `passing`
+    times their phase's mean speed (wire over duration): an object that hardly moves where its formation changes may as
+    well stop short of it. `optimiser` replaces the interior point by any optax optimiser (`descent.projected`). A phase
+    stops when its margin comes within `tolerance` of the bound or no longer improves by that share, or after `steps`.
+    `callback` sees every step; `traced` reuses the result of `trace`. A phase that holds the object keeps its duration
+    and gets the best torque of its statics, approached and left as fast as `rate_limit` allows. Where no torque can
+    hold a formation, nothing is searched and the status says so.
 
     Derivation, section 9. Raises RuntimeError without float64, ValueError for a `rate_limit` that is not positive,
     or `durations` that are not.

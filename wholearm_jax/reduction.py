@@ -42,7 +42,7 @@ class Table(eqx.Module):
     `entry` serves an object that arrives with `z_dot` from another formation: its rows times `z_dot` are `ds/dt` after
     the inelastic impact and the contacts' impulses [N s] (see `change`).
     `error` is the largest interpolation error, relative to each function's own size; `condition` the largest
-    condition number of the 5x5 matrix, at `condition_s`.
+    condition number of the 5x5 matrix.
     """
 
     breaks: Float[Array, "pieces_1"]
@@ -62,7 +62,6 @@ class Table(eqx.Module):
     torque_limit: Float[Array, "2"]
     error: Float[Array, ""]
     condition: Float[Array, ""]
-    condition_s: Float[Array, ""]
     status: Int[Array, ""]
 
     @property
@@ -139,7 +138,6 @@ def reduce_wire(system: System, wire: Wire) -> Table:
     worst = condition.max()
     eps = jnp.finfo(x.dtype).eps
     broken = (worst > 0.01 / eps) | ~(upright.min() > 0)
-    panel, at = jnp.unravel_index(jnp.argmax(jnp.where(upright > 0, condition, jnp.inf)), condition.shape)
     return Table(
         breaks=wire.breaks,
         count=wire.count,
@@ -154,7 +152,6 @@ def reduce_wire(system: System, wire: Wire) -> Table:
         torque_limit=system.torque_limit,
         error=error,
         condition=worst,
-        condition_s=_place(wire, panel, at),
         status=jnp.where(wire.status > 0, wire.status, jnp.where(broken, int(Status.SINGULAR), 0)),
     )
 
@@ -170,7 +167,7 @@ def blank(resolution: Resolution, contacts: int = 4) -> Table:
     each |= {"tangential": np.zeros(contacts, bool), "grip": np.zeros(contacts)}
     each |= {"entry": np.zeros((5, 5)), "first": np.zeros(pieces, int), "panels": np.ones(pieces, int)}
     filled = {name: array(value) for name, value in each.items()}
-    return Table(count=one, error=zero, condition=zero, condition_s=zero, status=whole, **filled)
+    return Table(count=one, error=zero, condition=zero, status=whole, **filled)
 
 
 class Change(eqx.Module):
@@ -224,12 +221,6 @@ def polynomial(coefficients: Float[Array, "powers ..."], xi: Float[Array, ""]) -
 def on_panel(coefficients: Float[Array, "panels powers ..."], panel: Int[Array, ""], xi: Float[Array, ""]):
     """The value of one of a table's functions at the place that `powers` tells."""
     return polynomial(pick(coefficients, panel), xi)
-
-
-def _place(wire, panel, at):
-    piece = wire.owner[panel]
-    local = panel - wire.first[piece] + (jnp.asarray(chebyshev(wire.nodes.shape[1]))[at] + 1) / 2
-    return wire.breaks[piece] + (wire.breaks[piece + 1] - wire.breaks[piece]) * local / wire.panels[piece]
 
 
 def _tail(values):

@@ -76,8 +76,6 @@ class Wire(Pieces):
     end: Float[Array, "5"]
     end_why: Int[Array, ""]
     end_contact: Int[Array, ""]
-    residual: Float[Array, ""]
-    start_gaps: Float[Array, "slots"]
     slip_sign: Float[Array, "pieces slots"]
     joint_sign: Float[Array, "pieces 2"]
     first: Int[Array, "pieces"]
@@ -95,9 +93,8 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     """Project `rough` (SI) onto the formation and follow its wire as `heading` says, to its end.
 
     Never raises for a configuration that does not work: `Wire.status` says `no_convergence` (the contacts cannot all
-    touch near the start; `start_gaps` tells which stay open), `left_formation` (there a contact is beyond its feature,
-    or the object inside a link), `singular` (fold or branch), `max_steps` (no end within
-    reach) or `ok`.
+    touch near the start), `left_formation` (there a contact is beyond its feature, or the object inside a link),
+    `singular` (fold or branch), `max_steps` (no end within reach) or `ok`.
     """
     rough = rough / system.configuration_unit
     until = heading.until_value / system.configuration_unit[heading.until_coordinate]
@@ -134,11 +131,7 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
         ],
         0,
     )
-    return eqx.tree_at(
-        lambda w: (w.status, w.residual, w.start_gaps),
-        wire,
-        (worst, residual, constraints(fixed.contacts, start) * fixed.length),
-    )
+    return eqx.tree_at(lambda w: w.status, wire, worst)
 
 
 def chebyshev(nodes: int) -> np.ndarray:
@@ -205,8 +198,6 @@ def _cut(system, fixed, marched, places, start, resolution):
         end=places.end,
         end_why=why,
         end_contact=contact,
-        residual=jnp.zeros(()),
-        start_gaps=jnp.zeros(4),
         slip_sign=slip_sign,
         joint_sign=joint_sign,
         first=first,
