@@ -47,8 +47,9 @@ def test_changes_are_passed_as_fast_as_asked(flown):
         last = found.result.phases[1:]
         return min(float(p.outcome.entered.speed) * float(p.duration) / float(p.traced.table.length) for p in last)
 
-    fast = wa.optimise(flown.scene, knots=31, passing=0.5, traced=tuple(p.traced for p in flown.result.phases))
-    assert slowest(flown) < 0.45 < 0.5 * (1 - 1e-6) < slowest(fast)
+    asked = 1.1 * slowest(flown)
+    fast = wa.optimise(flown.scene, knots=31, passing=asked, traced=tuple(p.traced for p in flown.result.phases))
+    assert slowest(fast) > asked * (1 - 1e-6)
     assert fast.result.status is wa.Status.OK
     assert 0.98 * flown.result.margin < fast.result.margin < flown.result.margin + 1e-3
 
@@ -82,7 +83,7 @@ def test_derivatives_pass_through_the_changes(flown):
     traced = wa.trace(scene)
     rng = np.random.default_rng(5)
     # More push at the beginning than planned, so that every formation ends at its own moment, before its time.
-    ramp = jnp.asarray(np.linspace(1.0, 0.9, torque.values.shape[0]))[:, None]
+    ramp = jnp.asarray(np.linspace(1.02, 1.0, torque.values.shape[0]))[:, None]
     base = torque.values * ramp
     way = jnp.asarray(rng.normal(size=base.shape)) * 0.05
 
@@ -93,13 +94,14 @@ def test_derivatives_pass_through_the_changes(flown):
         return jnp.stack([second.start, second.entered.speed, second.score.margin, *second.entered.impulse])
 
     exact = jax.jvp(lambda a: end(a, "forward"), (0.0,), (1.0,))[1]
+    assert abs(float(exact[0])) > 1e-3, "the moment of the change moves"
     weights = jnp.asarray(rng.normal(size=exact.shape))  # of all outputs at once, which compiles faster than of each
     reverse = jax.grad(lambda a: weights @ end(a, "both"))(0.0)
 
     def slope(h):
         return (end(h) - end(-h)) / (2 * h)
 
-    richardson = (4 * slope(5e-4) - slope(1e-3)) / 3
+    richardson = (4 * slope(2.5e-4) - slope(5e-4)) / 3
     np.testing.assert_allclose(exact, richardson, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(weights @ exact, reverse, rtol=1e-9, atol=1e-12)
 
