@@ -10,8 +10,10 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax import batch_command, command
-from wholearm_jax.batch import check_chunks, from_result
-from wholearm_jax.store import StoreError, identity, open_store
+from wholearm_jax import survey as survey_module
+from wholearm_jax.batch import Checked, check_chunks, from_result
+from wholearm_jax.scene_file import to_dict
+from wholearm_jax.store import StoreError, fingerprint, identity, open_store
 from wholearm_jax.survey import influences, survey
 from wholearm_jax.variation import stack, vary
 
@@ -109,6 +111,79 @@ def test_the_survey_counts_and_ranks(scene, checked):
     assert found[1] > 0.95
     assert abs(found[0]) < 0.3
     assert found[2] == 0
+
+
+def test_the_survey_says_what_fails_where(scene, monkeypatch):
+    """Seven scenes in two chunks, by hand."""
+    ok, lost, stuck = (int(s) for s in (wa.Status.OK, wa.Status.CONTACT_LOST, wa.Status.STUCK))
+    rows = [  # status, margin, contact, phase
+        (ok, 0.4, 0, 1),
+        (lost, -0.1, 2, 1),
+        (stuck, -np.inf, -1, 0),
+        (lost, -0.3, 2, 1),
+        (ok, 0.2, 1, 0),
+        (lost, 0.1, 3, 0),
+        (lost, -0.2, 2, 1),
+    ]
+    status, margin, contact, phase = (np.array(column) for column in zip(*rows, strict=True))
+    whole = Checked(status, margin, np.zeros(7), contact, phase, np.zeros((7, 5)))
+    parts = [Checked(*(column[part] for column in whole)) for part in (slice(0, 4), slice(4, 7))]
+    told = survey(scene, parts, 7)
+    third, fourth = scene.phases[1].formation.names[2], scene.phases[0].formation.names[3]
+    assert told.holds == 2
+    assert told.failures == {
+        ("flip right", "contact_lost", third): 3,
+        ("slide left", "contact_lost", fourth): 1,
+        ("slide left", "stuck", None): 1,
+    }
+    assert told.lines[0].startswith("2 of 7 hold: 28.57 %")
+    assert told.lines[2] == f"flip right: contact_lost at {third}: 3"
+    assert told.lines[-1] in ("slide left: stuck: 1", f"slide left: contact_lost at {fourth}: 1")
+    assert told.quantiles["0.5"] == -0.1
+    assert list(told.quantiles.values()) == sorted(told.quantiles.values())
+    assert told.as_dict()["failures"][0] == {
+        "phase": "flip right",
+        "status": "contact_lost",
+        "contact": third,
+        "count": 3,
+    }
+    np.testing.assert_array_equal(told.numbers, np.arange(7))
+    np.testing.assert_array_equal(told.margins, margin)
+    monkeypatch.setattr(survey_module, "SAMPLE", 3)
+    few = survey(scene, parts, 7)
+    np.testing.assert_array_equal(few.numbers, [0, 3, 6])
+    np.testing.assert_array_equal(few.margins, margin[[0, 3, 6]])
+    assert few.failures == told.failures
+
+
+def test_what_a_store_is_of(tmp_path, scene, schedule):
+    wanted = identity(10, 4, seed=1)
+    open_store(tmp_path / "a.zarr", wanted)
+    with pytest.raises(StoreError, match="another version"):
+        open_store(tmp_path / "a.zarr", wanted | {"version": "0.0"})
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(StoreError):
+        open_store(tmp_path / "file", wanted)
+    assert (tmp_path / "file").read_text() == "mine"
+    heavier = eqx.tree_at(lambda s: s.object.mass, scene, scene.object.mass * (1 + 1e-15))
+    data = to_dict(scene)
+    renamed = wa.parse(data | {"phase": [data["phase"][0] | {"name": "another"}, data["phase"][1]]})
+    prints = {fingerprint(*trees) for trees in ([scene], [heavier], [renamed], [scene, schedule])}
+    assert len(prints) == 4
+    assert fingerprint(scene) == fingerprint(wa.load("heptagon"))
+
+
+def test_a_store_left_half_made_is_made_again_and_a_half_written_chunk_is_not_done(tmp_path):
+    import zarr
+
+    wanted, path = identity(4, 2, seed=1), tmp_path / "half.zarr"
+    zarr.create_group(str(path)).create_array("margin", shape=(4,), dtype="float64")  # killed before it said what it is
+    store = open_store(path, wanted)
+    assert store.chunks == 2
+    ones = Checked(*(np.ones((2, *shape)) for shape in ((), (), (), (), (), (5,))))._asdict()
+    with pytest.raises(ValueError, match="could not convert"):
+        store.write(0, ones | {"end": np.full((2, 5), "not a number")})
+    assert store.done().tolist() == [False, False]
 
 
 def test_a_store_of_something_else_is_refused(tmp_path):

@@ -15,12 +15,14 @@ from matplotlib.path import Path as Outline
 from scipy.stats import binomtest
 
 import wholearm_jax as wa
-from wholearm_jax.contacts import contacts, frames
-from wholearm_jax.execution import Ending, Tolerance, clock, drive, execute, start_of
+from wholearm_jax import execution, perturbation
+from wholearm_jax.contacts import contacts, frames, normal_rows
+from wholearm_jax.execution import Ending, Tolerance, clock, drive, execute, judge, start_of, target_of
 from wholearm_jax.execution_drawing import animate, draw_execution, draw_execution_strip
 from wholearm_jax.free_bodies import _wedges, free_bodies
-from wholearm_jax.perturbation import Amounts, perturb, start_near, wilson
+from wholearm_jax.perturbation import Amounts, _perturbed, perturb, start_near, wilson
 from wholearm_jax.scene import body, formation
+from wholearm_jax.system import system
 
 DATA = Path(__file__).parent / "data"
 NAMES = ("heptagon", "hexagon")
@@ -198,6 +200,81 @@ def test_a_perturbed_start_touches(predictions):
     assert np.abs(frames(several, z).gap).max() < 1e-15
     moved = z - start_of(predictions["heptagon"])
     assert 1e-5 < np.abs(moved[:2]).max() < 1e-3
+
+
+def test_a_perturbed_start_is_the_nearest_that_touches(predictions):
+    """What is left of a shift, in object radii, lies along the wire; the rest closed gaps."""
+    scene, nominal = predictions["heptagon"].scene, start_of(predictions["heptagon"])
+    shift = np.array([4e-5, -3e-5, 2e-5])
+    mechanics = system(body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)
+    unit = np.asarray(mechanics.configuration_unit)
+    z = start_near(scene, nominal, shift)
+    *_, along = np.linalg.svd(np.asarray(normal_rows(mechanics.contacts, jnp.asarray(z / unit))))[2]
+    radius = float(mechanics.length)
+    given, kept = along[:3] @ shift / radius, along @ ((z - nominal) / unit)
+    assert abs(given) > 1e-4
+    assert kept == pytest.approx(given, rel=1e-2)
+
+
+@pytest.mark.parametrize("which", ["friction", "mass", "geometry"])
+def test_each_amount_changes_what_it_says(which, predictions):
+    scene = predictions["heptagon"].scene
+    shape, count, drawn = scene.object, int(scene.object.count), []
+    for amounts in (Amounts(**{which: 0.1}), Amounts(0.1, 0.1, 0.1)):
+        rng = np.random.default_rng(4)
+        drawn.append([_perturbed(scene, amounts, rng).object for _ in range(20)])
+    alone, together = drawn
+    parts = {
+        "friction": [np.asarray(one.friction / shape.friction) - 1 for one in alone],
+        "mass": [np.atleast_1d(one.mass / shape.mass - 1) for one in alone],
+        "geometry": [np.asarray(one.vertices - shape.vertices)[:count] for one in alone],
+    }
+    for name, shifts in parts.items():
+        sizes = np.abs(np.concatenate([s.ravel() for s in shifts]))
+        assert 0.08 < sizes.max() <= 0.1 + 1e-12 if name == which else sizes.max() < 1e-15
+    for one, other in zip(alone, together, strict=True):  # each keeps its own sequence
+        leaf = {"friction": "friction", "mass": "mass", "geometry": "vertices"}[which]
+        np.testing.assert_array_equal(getattr(one, leaf), getattr(other, leaf))
+        np.testing.assert_array_equal(
+            one.vertices[count:], np.broadcast_to(one.vertices[count - 1], (8, 2))[: len(one.vertices) - count]
+        )
+
+
+def test_a_start_is_drawn_for_every_copy_whatever_is_rolled_out_together(predictions, monkeypatch):
+    settings = {"timestep": 1e-3, "seed": 2}
+    together = perturb(predictions["hexagon"], 3, Amounts(start=5e-4), **settings)
+    monkeypatch.setattr(perturbation, "CHUNK", 2)
+    apart = perturb(predictions["hexagon"], 3, Amounts(start=5e-4), **settings)
+    ends = [np.stack([run.end for run in one.runs]) for one in (together, apart)]
+    np.testing.assert_allclose(*ends, atol=1e-12)
+    assert np.abs(np.diff(ends[0], axis=0)).max(1).min() > 1e-9, "no two start alike"
+
+
+@pytest.mark.parametrize(
+    ("off", "ending"),
+    [
+        ((0.0, 0.0, 0.0), Ending.OK),
+        ((0.0, 0.0, 0.008), Ending.OK),
+        ((0.0, 0.0, 0.02), Ending.ASTRAY),
+        ((0.0, 0.0, -0.02), Ending.ASTRAY),
+        ((-0.04, 0.0, 0.0), Ending.CONTACT_LOST),
+    ],
+)
+def test_an_end_is_judged_by_place_angle_and_contacts(off, ending, predictions):
+    target = target_of(predictions["hexagon"])
+    z = target + np.append(off, np.zeros(2))
+    assert judge(predictions["hexagon"].scene, z, target, Tolerance(5e-3, 0.01))[0] is ending
+    near, far = (
+        judge(predictions["hexagon"].scene, target + 2e-3, target, Tolerance(size, 0.01))[0] for size in (5e-3, 2.5e-3)
+    )
+    assert near is Ending.OK
+    assert far is not Ending.OK
+
+
+def test_a_simulation_that_diverges_is_said(predictions, monkeypatch):
+    honest = execution.drive
+    monkeypatch.setattr(execution, "drive", lambda *a: (honest(*a)[0], False))
+    assert execute(predictions["heptagon"], timestep=1e-3).ending is Ending.DIVERGED
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 10), (8, 10), (10, 10), (187, 200)])
