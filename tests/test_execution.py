@@ -235,9 +235,8 @@ def test_each_amount_changes_what_it_says(which, predictions):
     for one, other in zip(alone, together, strict=True):  # each keeps its own sequence
         leaf = {"friction": "friction", "mass": "mass", "geometry": "vertices"}[which]
         np.testing.assert_array_equal(getattr(one, leaf), getattr(other, leaf))
-        np.testing.assert_array_equal(
-            one.vertices[count:], np.broadcast_to(one.vertices[count - 1], (8, 2))[: len(one.vertices) - count]
-        )
+        padding = np.asarray(one.vertices)[count - 1 :]
+        np.testing.assert_array_equal(padding, np.broadcast_to(padding[0], padding.shape))
 
 
 def test_a_start_is_drawn_for_every_copy_whatever_is_rolled_out_together(predictions, monkeypatch):
