@@ -12,7 +12,8 @@ import wholearm_jax as wa
 from wholearm_jax import batch_command, command
 from wholearm_jax import survey as survey_module
 from wholearm_jax.batch import Checked, check_chunks, from_result
-from wholearm_jax.scene_file import to_dict
+from wholearm_jax.polygon_file import read_polygons
+from wholearm_jax.scene_file import SceneError, to_dict
 from wholearm_jax.store import StoreError, fingerprint, identity, open_store
 from wholearm_jax.survey import influences, survey
 from wholearm_jax.variation import stack, vary
@@ -247,3 +248,22 @@ def test_bad_input_of_the_command(tmp_path, monkeypatch, capsys, arguments, said
 def test_scenes_that_vary_arrive_as_the_command_line_says():
     """In Python as by `wholearm check`: near the end, as no varied plan ends where torques were not made for it."""
     assert inspect.signature(wa.check).parameters["arrival"].default == batch_command.ARRIVAL
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "not a NumPy .npz file"),
+        (b"PK\x03\x04 cut short", "not a NumPy .npz file"),
+        ({"vertices": np.full((1, 3, 2), "a")}, "vertices: needs real numbers"),
+        ({"vertices": np.ones((1, 3, 2), complex)}, "vertices: needs real numbers"),
+    ],
+)
+def test_files_of_polygons_that_are_none(tmp_path, scene, content, said):
+    path = tmp_path / "objects.npz"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        np.savez(path, **content)
+    with pytest.raises(SceneError, match=said):
+        read_polygons(path, scene)

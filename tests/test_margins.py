@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.plan import least, outcomes
+from wholearm_jax import optimiser
+from wholearm_jax.plan import least, outcomes, roomy
 from wholearm_jax.scene import replace_duration
 from wholearm_jax.scene_file import to_dict
 from wholearm_jax.stepping import Integration
@@ -46,11 +47,13 @@ def test_a_part_of_a_motion_has_no_margin(heptagon):
     assert float(least(scene, short)) == -np.inf
 
 
-def test_optimise_takes_as_many_knots_as_it_is_told(heptagon):
-    scene, _ = heptagon
-    slide = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
-    found = wa.optimise(slide, knots=271, steps=40)
-    assert found.result.status is wa.Status.OK, found.result.message
+@pytest.mark.parametrize("rows", [51, 271, 2001])
+def test_there_is_room_for_a_step_at_every_row(heptagon, rows):
+    """In what `optimise` simulates as in what `margin` does; up to 128 rows a phase share one program."""
+    scene, torque = heptagon
+    assert optimiser._accurately(rows).max_steps >= 2 * rows
+    assert roomy(Integration(), scene, finer(torque, rows)).max_steps >= 2 * rows
+    assert (roomy(Integration(), scene, finer(torque, rows)).max_steps == Integration().max_steps) == (rows <= 128)
 
 
 @pytest.mark.parametrize("digits", [9, 12])

@@ -4,6 +4,7 @@ What takes long to import is imported where it is used: a command that needs non
 """
 
 import sys
+import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -148,7 +149,7 @@ def writing(where: str):
     try:
         yield
     except OSError as error:
-        raise BadInput(f"{where}: cannot be written: {error.strerror}") from None
+        raise BadInput(f"{where}: cannot be written: {error.strerror or error}") from None
 
 
 def made_folder(out: Path | None) -> Path | None:
@@ -157,7 +158,5 @@ def made_folder(out: Path | None) -> Path | None:
         return None
     with writing(f"--out {out}"):
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".wholearm"
-        probe.write_text("")
-        probe.unlink()
+        tempfile.TemporaryFile(dir=out).close()
     return out

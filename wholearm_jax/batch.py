@@ -152,7 +152,7 @@ def check(
     """Check a torque schedule against many scenes: the first `count` of an ensemble, or all that are given.
 
     `scenes` may differ in every number, in formations and in the number of vertices (see `variation.stack`).
-    `tolerance` bounds the error of the margin [N]; below 1e-9 all is computed as by `simulate`. A phase arrives when
+    Margins are right to 1e-6 N; a `tolerance` [N] below 1e-9 has all computed as by `simulate`. A phase arrives when
     it ends within a share `arrival` of its wire's length of the end (1e-6 for a plan that does not vary, by
     `simulate`), at a speed that fits (`verdict.BRAKING`). Memory
     is that of `chunk` scenes beside the result. Returns `Checked`: status, margin, time, contact, phase and end pose of

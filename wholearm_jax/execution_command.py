@@ -1,6 +1,7 @@
 """`wholearm execute`: a schedule on free bodies with soft contacts."""
 
 import sys
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -105,5 +106,8 @@ def _draw_execution(done, folder: Path, video: bool) -> None:
     save_figure(lambda: draw_execution(done), folder, "execution")
     if video:
         save_figure(lambda: draw_execution_strip(done), folder, "frames")
-        animate(done).save(folder / "execution.gif", writer="pillow")  # which needs no further program
+        with tempfile.TemporaryDirectory(dir=folder) as beside:  # moved into place once it is whole
+            moving = Path(beside, "execution.gif")
+            animate(done).save(moving, writer="pillow")  # which needs no further program
+            moving.replace(folder / "execution.gif")
         plt.close("all")

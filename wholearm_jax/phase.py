@@ -26,6 +26,8 @@ from wholearm_jax.system import system
 from wholearm_jax.verdict import ARRIVAL, GOALS, Verdict, judge
 from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
 
+NOWHERE = 1e-9  # length [object radii] of a wire that ends where it begins
+
 
 class Traced(NamedTuple):
     """A phase's wire and its table."""
@@ -79,7 +81,10 @@ def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integra
     entered = change(table, arriving)
     motion = move(table, seen, duration, how=how, speed=jnp.maximum(entered.speed, 0.0))
     scored = score(table, seen, duration, motion, how)
-    whole = (table.status == int(Status.OK)) & (motion.status != int(Status.MAX_STEPS))  # of a part nothing is known
+    # A wire whose start lies beyond an edge of its formation, be it by rounding, is as good a wire as any beside it.
+    beyond = (table.status == int(Status.LEFT_FORMATION)) & (table.length > NOWHERE)
+    known = (table.status == int(Status.OK)) | beyond
+    whole = known & (motion.status != int(Status.MAX_STEPS))  # of a part nothing is known
     scored = eqx.tree_at(lambda one: one.margin, scored, jnp.where(whole, scored.margin, -jnp.inf))
     verdict = judge(table, motion, scored, goal, entered, arrival)
     last = jnp.maximum(motion.count - 1, 0)

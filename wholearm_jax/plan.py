@@ -14,7 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.phase import Outcome, Traced, destination, end_configuration, prepare, run, start_configuration
+from wholearm_jax.phase import (
+    NOWHERE,
+    Outcome,
+    Traced,
+    destination,
+    end_configuration,
+    prepare,
+    run,
+    start_configuration,
+)
 from wholearm_jax.precision import array, digits, require_x64
 from wholearm_jax.programs import transformed
 from wholearm_jax.result import Result, describe
@@ -26,7 +35,6 @@ from wholearm_jax.verdict import ARRIVAL, GOALS
 from wholearm_jax.wire import Resolution
 
 ROUNDING = 1e4  # of a precision's last digit, the interpolation error that more panels do not make smaller
-NOWHERE = 1e-9  # length [object radii] of a wire that ends where it begins
 CONTINUITY = 1e-6  # metres and radians by which a phase may begin beside the end of the one before it
 
 
@@ -191,9 +199,10 @@ def margin(
     `mu c_n - |c_t|`), formations assumed to hold.
 
     Differentiable, in forward and reverse mode, with respect to the torques and every float of the scene; negative
-    where a contact would pull; `-inf` where a phase has no motion to score. Whether the plan succeeds is for
-    `simulate` to say. Phases that hold the object do not count. That the schedule steps is seen where its times and the
-    durations are numbers; where they are transformed too, say so: `how=Integration(adjoint="both", steps=True)`.
+    where a contact would pull; `-inf` where a phase has no motion to score, or its wire is not known. Whether the plan
+    succeeds is for `simulate` to say. Phases that hold the object do not count. That the schedule steps is seen where
+    its times and the durations are numbers; where they are transformed too, say so: `how=Integration(adjoint="both",
+    steps=True)`.
 
     The forces are those of the paper's section 2.2, its `c_n > 0` (derivation, sections 4 and 7).
     In float32 it has four digits (`docs/accuracy.md`).

@@ -6,6 +6,8 @@ uniform.
 """
 
 from pathlib import Path
+from zipfile import BadZipFile
+from zlib import error as ZlibError
 
 import jax
 import numpy as np
@@ -18,12 +20,15 @@ from wholearm_jax.scene_file import SceneError
 def read_polygons(path: Path, scene: Scene) -> Given:
     """The scene with each polygon of a file. Raises `SceneError` naming the file, the entry and what is wrong."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             held = {name: np.asarray(file[name]) for name in file.files}
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file") from None
-    except (OSError, ValueError, AttributeError) as error:
+    except (OSError, ValueError, AttributeError, TypeError, EOFError, BadZipFile, ZlibError) as error:
         raise SceneError(f"{path}: not a NumPy .npz file: {error}") from None
+    for name, values in held.items():
+        if values.dtype.kind not in "fiu":
+            raise SceneError(f"{path}: {name}: needs real numbers, not {values.dtype}")
     given = held.get("vertices")
     if given is None or given.ndim != 3 or given.shape[2] != 2 or given.shape[1] < 3 or not len(given):
         raise SceneError(f"{path}: vertices: needs an array (polygons, vertices, 2) of at least 3 vertices")
