@@ -30,7 +30,7 @@ ORDER = (
     *("schedule", "stepping", "landing", "motion", "forces", "verdict", "holding"),
     *("phase", "result", "sampling", "plan", "gradient", "gradient_check"),
     *("squeeze", "shooting", "linearisation", "descent", "pacing"),
-    *("formations", "guesses", "handover", "optimiser", "baseline"),
+    *("formations", "guesses", "handover", "group", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),
     *("free_bodies", "execution", "perturbation"),
     *("scene_file", "result_file", "store", "polygon_file", "palette", "report"),

@@ -193,6 +193,12 @@ def test_what_robust_does_not_know(option, wholearm, tmp_path):
     assert_bad_input(answer, f"--robust: knows no {option[0]}")
 
 
+def test_robust_knows_no_holds(wholearm, scene_file):
+    path = scene_file(lambda data: data["phase"][1].update(name="wait", hold=True) or data["phase"][1].pop("toward"))
+    answer = wholearm("optimise", path, "--robust", "friction=20%")
+    assert_bad_input(answer, "--robust: phase 'wait' holds the object")
+
+
 @pytest.mark.parametrize(
     ("arguments", "cause"),
     [

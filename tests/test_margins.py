@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax import optimiser
 from wholearm_jax.plan import least, outcomes, roomy
 from wholearm_jax.scene import replace_duration
 from wholearm_jax.scene_file import to_dict
-from wholearm_jax.stepping import Integration
+from wholearm_jax.stepping import Integration, with_room
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +49,7 @@ def test_a_part_of_a_motion_has_no_margin(heptagon):
 def test_there_is_room_for_a_step_at_every_row(heptagon, rows):
     """In what `optimise` simulates as in what `margin` does; up to 128 rows a phase share one program."""
     scene, torque = heptagon
-    assert optimiser._accurately(rows).max_steps >= 2 * rows
+    assert with_room(Integration(), rows).max_steps >= 2 * rows
     assert roomy(Integration(), scene, finer(torque, rows)).max_steps >= 2 * rows
     assert (roomy(Integration(), scene, finer(torque, rows)).max_steps == Integration().max_steps) == (rows <= 128)
 

@@ -154,10 +154,9 @@ def check(
     `scenes` may differ in every number, in formations and in the number of vertices (see `variation.stack`).
     Margins are right to 1e-6 N; a `tolerance` [N] below 1e-9 has all computed as by `simulate`. A phase arrives when
     it ends within a share `arrival` of its wire's length of the end (1e-6 for a plan that does not vary, by
-    `simulate`), at a speed that fits (`verdict.BRAKING`). Memory
-    is that of `chunk` scenes beside the result. Returns `Checked`: status, margin, time, contact, phase and end pose of
-    each scene. Never raises for a scene that fails: that is a status. Raises
-    ValueError for a schedule shorter than a plan.
+    `simulate`), at a speed that fits (`verdict.BRAKING`). Memory is that of `chunk` scenes beside the result. Returns
+    `Checked`: status, margin, time, contact, phase and end pose of each scene. Never raises for a scene that fails:
+    that is a status. Raises ValueError for a schedule shorter than a plan.
     """
     source = scenes if isinstance(scenes, Ensemble) else Given(scenes if isinstance(scenes, Scene) else stack(scenes))
     if count is None:

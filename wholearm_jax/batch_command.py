@@ -127,7 +127,10 @@ def optimise_robustly(varied, folder: Path | None, samples: int, knots: int, ste
     from wholearm_jax.result_file import discard, write_torque
     from wholearm_jax.robust import optimise_robustly as find
 
-    found = find(varied, samples=samples, knots=knots, steps=steps, arrival=arrival)
+    try:
+        found = find(varied, samples=samples, knots=knots, steps=steps, arrival=arrival)
+    except ValueError as error:
+        raise BadInput(f"--robust: {error}") from None
     for name, (nominal, robust) in (("sampled", found.seen), ("unseen", found.unseen)):
         told = (f"{100 * h.share:.1f} % hold, worst margin {h.margin:.4g} N" for h in (nominal, robust))
         print(f"{samples} {name} scenes: nominal {next(told)}; robust {next(told)}")

@@ -102,12 +102,13 @@ def _draw_execution(done, folder: Path, video: bool) -> None:
 
     from wholearm_jax.drawing import save_figure
     from wholearm_jax.execution_drawing import animate, draw_execution, draw_execution_strip
+    from wholearm_jax.writing import write_whole
 
     save_figure(lambda: draw_execution(done), folder, "execution")
     if video:
         save_figure(lambda: draw_execution_strip(done), folder, "frames")
-        with tempfile.TemporaryDirectory(dir=folder) as beside:  # moved into place once it is whole
-            moving = Path(beside, "execution.gif")
-            animate(done).save(moving, writer="pillow")  # which needs no further program
-            moving.replace(folder / "execution.gif")
+        with tempfile.TemporaryDirectory() as elsewhere:
+            drawn = Path(elsewhere, "execution.gif")
+            animate(done).save(drawn, writer="pillow")  # which needs no further program
+            write_whole(folder / "execution.gif", drawn.read_bytes())
         plt.close("all")

@@ -27,10 +27,10 @@ from wholearm_jax.holding import CLOSE, EXACT, Departure, Statics
 from wholearm_jax.phase import Traced, balance_at_start
 from wholearm_jax.precision import array
 from wholearm_jax.programs import Program
-from wholearm_jax.reduction import Table, on_panel, powers
+from wholearm_jax.reduction import Table
 from wholearm_jax.scene import Phase, Scene
 from wholearm_jax.schedule import Torque, evenly
-from wholearm_jax.squeeze import Bound
+from wholearm_jax.squeeze import Bound, coefficients
 from wholearm_jax.status import Status
 
 BRISK = 1.0  # least acceleration with which an object arrives, or sets out at once [wire lengths a duration squared]
@@ -72,6 +72,11 @@ class Handover(NamedTuple):
     lead: float
     share: float
 
+    @property
+    def serves(self) -> bool:
+        """Whether there are such torques."""
+        return self.share > 0
+
 
 def handovers(
     scene: Scene,
@@ -96,7 +101,7 @@ def handovers(
         return Resting(*balance_at_start(scene, scene.phases[k], traced[k]), float(tops[k].value))
 
     def near(group, begin):
-        if begin is None or not begin.share > 0:
+        if begin is None or not begin.serves:
             return None
         time = sum(float(scene.phases[k].duration) for k in group) - begin.lead
         return Near(begin.begin, rate_limit * time)
@@ -136,7 +141,7 @@ def steady(
     best = balance.steadiest(departure).torque
     if rate_limit is None:
         return evenly(duration, np.tile(best, (knots, 1)))
-    first, last = (best if one is None or not one.share > 0 else one.torque for one in (begin, end))
+    first, last = (one.torque if one is not None and one.serves else best for one in (begin, end))
 
     def by(share):
         """A torque on the way from the last to the best one, and the times that it takes to come there and to go."""
@@ -205,7 +210,7 @@ def _nothing():
 
 
 def _arriving(phase: Moving, limit, rate_limit: float) -> list[_Conditions]:
-    motion, forces = _at_end(phase.table)
+    motion, forces = _terms_at(phase.table, -1)
     return [
         _bearing(forces / phase.bound, limit),
         _accelerating(-motion, limit, TAU, *_range(phase, motion, rate_limit)),
@@ -214,7 +219,7 @@ def _arriving(phase: Moving, limit, rate_limit: float) -> list[_Conditions]:
 
 def _setting_out(phase: Moving, limit, rate_limit: float) -> tuple[list[_Conditions], list[_Conditions]]:
     """At `tau` itself, and at `sigma`."""
-    motion, forces = _at_start(phase.table)
+    motion, forces = _terms_at(phase.table, 0)
     forces = forces / phase.bound
     at_once = [_bearing(forces, limit), _accelerating(motion, limit, TAU, *_range(phase, motion, rate_limit))]
     return at_once, [_bearing(forces, limit, SIGMA), _accelerating(motion, limit, SIGMA, 0.0, 0.0)]
@@ -308,16 +313,12 @@ def _solved(conditions: list[_Conditions], limit, rate_limit: float, longest: fl
     return Handover(tau, sigma if longest > 0 else tau, lead, float(x[LEVEL]))
 
 
-def _at_start(table: Table):
-    return jax.device_get(_terms(table, array(0), table.breaks[0]))
-
-
-def _at_end(table: Table):
-    return jax.device_get(_terms(table, table.count - 1, table.breaks[-1]))
+def _terms_at(table: Table, end: int):
+    return jax.device_get(_terms(table, table.breaks[end]))
 
 
 @Program
-def _terms(table: Table, piece, s) -> tuple[Float[Array, "5"], Float[Array, "slacks 5"]]:
+def _terms(table: Table, s) -> tuple[Float[Array, "5"], Float[Array, "slacks 5"]]:
     """Coefficients of the acceleration and of the slacks at a place of a wire."""
-    panel, xi = powers(table, piece, s)
-    return on_panel(table.acceleration, panel, xi), linear_slacks(table, on_panel(table.force, panel, xi))
+    motion, forces = coefficients(table, s)
+    return motion, linear_slacks(table, forces)

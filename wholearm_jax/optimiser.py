@@ -13,35 +13,32 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.descent import advance, begin, interior_point, projected
+from wholearm_jax.descent import advance, begin
+from wholearm_jax.group import Group, Wanted, descent_method, optimise_group, stacked_tables
 from wholearm_jax.guesses import guesses
 from wholearm_jax.handover import Handover, handovers, steady
 from wholearm_jax.linearisation import Limits
-from wholearm_jax.pacing import HOW, Problem, Step, descend
+from wholearm_jax.pacing import HOW, Step
 from wholearm_jax.phase import Traced, balance_at_start, run
-from wholearm_jax.plan import outcomes, stacked, trace
+from wholearm_jax.plan import outcomes, trace
 from wholearm_jax.precision import array, require_x64
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import blank
-from wholearm_jax.result import Result, describe, stays
-from wholearm_jax.scene import Phase, Scene, replace_duration
-from wholearm_jax.schedule import Torque, evenly, padded, rounded
+from wholearm_jax.result import Result, describe
+from wholearm_jax.scene import Scene, replace_duration
+from wholearm_jax.schedule import Torque, evenly, in_turn, padded, rounded
 from wholearm_jax.shooting import Variables
 from wholearm_jax.squeeze import Bound, bound
 from wholearm_jax.status import Status
-from wholearm_jax.stepping import Integration
+from wholearm_jax.stepping import Integration, with_room
 from wholearm_jax.wire import Resolution
 
-TORQUE_SHARE = 0.9  # share of the torque limits that a start may use
 LEADS = (0.25, 0.1)  # shares of a phase for which its object may wait before it sets out, where rates are limited
-SHORTEST = 0.01  # share of its longest time that a phase moves at the least
 PASSING = 0.2  # least speed with which a phase is entered that does not begin at rest, over its mean speed
-GOOD = 0.99  # share of the bound with which no further start is tried
 
 
 @dataclass(frozen=True)
@@ -85,7 +82,7 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
         start = guesses([at], [float(phase.duration)], knots, 1.0)[0]
         return evenly(float(phase.duration), at.table.torque_limit * start.torque[0])
 
-    return _in_turn([torques(*pair) for pair in zip(traced, scene.phases, strict=True)])
+    return in_turn([torques(*pair) for pair in zip(traced, scene.phases, strict=True)])
 
 
 def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...]:
@@ -160,7 +157,7 @@ def optimise(
     tops = bounds(scene, traced=traced)
     for one in ready:
         one.result()
-    wanted = _Wanted(knots, _rows(scene, knots), steps, rate_limit, durations, passing, optimiser, tolerance, callback)
+    wanted = Wanted(knots, _rows(scene, knots), steps, rate_limit, durations, passing, optimiser, tolerance, callback)
     found = []
     for lead in LEADS if rate_limit is not None else LEADS[:1]:
         found.append(_attempt(scene, traced, tops, wanted, lead))
@@ -169,22 +166,7 @@ def optimise(
     return max(found, key=lambda one: one.result.margin)
 
 
-@dataclass(frozen=True)
-class _Wanted:
-    """What `optimise` was asked for; `rows` is the size of the whole plan's schedule: those of one share programs."""
-
-    knots: int
-    rows: int
-    steps: int
-    rate_limit: float | None
-    durations: tuple[float, float] | None
-    passing: float
-    optimiser: optax.GradientTransformation | None
-    tolerance: float
-    callback: Callable[[Step], None] | None
-
-
-def _attempt(scene: Scene, traced, tops, wanted: _Wanted, lead: float) -> Optimised:
+def _attempt(scene: Scene, traced, tops, wanted: Wanted, lead: float) -> Optimised:
     """All phases one after the other, objects waiting at most a share `lead` of a phase before they set out."""
     groups, found, history, stopped = _groups(scene), [], [], []
     changes: list[Handover | None] = [None] * (len(groups) - 1)
@@ -196,16 +178,16 @@ def _attempt(scene: Scene, traced, tops, wanted: _Wanted, lead: float) -> Optimi
             found.append(steady(scene, parts[0], traced[group[0]], wanted.knots, wanted.rate_limit, *ends))
             stopped.append("the best torque of a linear programme")
             continue
-        task = _Task(group[0], parts, [traced[k] for k in group], [tops[k] for k in group], *ends, wanted)
-        schedules, why, taken = _optimise_group(scene, task)
+        one = Group(group[0], parts, [traced[k] for k in group], [tops[k] for k in group], *ends, wanted)
+        schedules, why, taken = optimise_group(scene, one)
         found += schedules
         stopped += [why] * len(group)
         history += taken
     lengths = [float(np.asarray(f.times)[-1]) for f in found]
     phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, lengths, strict=True))
     scene = eqx.tree_at(lambda s: s.phases, scene, phases)
-    torque = _in_turn(found)
-    result = describe(scene, torque, traced, outcomes(scene, torque, traced, _accurately(wanted.knots)))
+    torque = in_turn(found)
+    result = describe(scene, torque, traced, outcomes(scene, torque, traced, with_room(Integration(), wanted.knots)))
     return Optimised(scene, torque, result, tops, tuple(stopped), tuple(history))
 
 
@@ -215,18 +197,13 @@ def _lasting(scene: Scene, duration: float) -> Scene:
     return eqx.tree_at(lambda s: s.phases, scene, tuple(phases))
 
 
-def _accurately(knots: int) -> Integration:
-    """How schedules with so many knots a phase are simulated."""
-    return Integration(max_steps=rounded(2 * knots, Integration().max_steps))
-
-
 def compile_ahead(
     scene: Scene, *, knots: int = 51, optimiser: optax.GradientTransformation | None = None
 ) -> list[Future[None]]:
     """Begin to compile the programs of `optimise` in threads of their own, as can be done while wires are traced."""
     rows = _rows(scene, knots)
     sizes = {len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"}
-    return [_ahead(n, knots, rows, _method(optimiser, n)) for n in sorted(sizes)]
+    return [_ahead(n, knots, rows, descent_method(optimiser, n)) for n in sorted(sizes)]
 
 
 def _rows(scene: Scene, knots: int) -> int:
@@ -243,93 +220,6 @@ def _groups(scene: Scene) -> list[list[int]]:
     return groups
 
 
-@dataclass(frozen=True)
-class _Task:
-    index: int
-    phases: tuple[Phase, ...]
-    traced: list[Traced]
-    tops: list[Bound]
-    begin: Handover | None  # where torque rates are limited, and a phase stands before
-    end: Handover | None  # or behind
-    wanted: _Wanted
-
-    @property
-    def pins(self) -> dict[tuple[int, int], np.ndarray]:
-        """Torques that stay as they are, in units of their limits, by phase and knot."""
-        begin = [] if self.begin is None else [((0, 0), self.begin, self.begin.begin / self.limits[0])]
-        end = [] if self.end is None else [((-1, -1), self.end, self.end.torque / self.limits[-1])]
-        return {at: torque for at, change, torque in [*begin, *end] if change.share > 0}
-
-    @property
-    def most(self) -> float:
-        """The share of the bounds that the torques at both ends allow."""
-        changes = [change.share for change in (self.begin, self.end) if change is not None and change.share > 0]
-        return min([1.0, *changes])
-
-    @property
-    def lead(self) -> np.ndarray:
-        """How long the object waits in each phase before it sets out."""
-        first = self.begin.lead if self.begin is not None else 0.0
-        return np.append(first, np.zeros(len(self.phases) - 1))
-
-    @property
-    def durations(self) -> np.ndarray:
-        """How long it moves in each."""
-        return np.array([float(p.duration) for p in self.phases]) - self.lead
-
-    @property
-    def limits(self) -> np.ndarray:
-        """The largest torques of each [N m]."""
-        return np.stack([np.asarray(at.table.torque_limit) for at in self.traced])
-
-    @property
-    def bounds(self) -> np.ndarray:
-        return np.array([float(top.value) for top in self.tops])
-
-    def problem(self, limits: Limits) -> Problem:
-        """What is descended on."""
-        tables = _stacked([at.table for at in self.traced])
-        return Problem(self.index, tables, self.bounds, limits, self.wanted.steps, self.wanted.tolerance)
-
-
-def _optimise_group(scene: Scene, task: _Task) -> tuple[list[Torque], str, list[Step]]:
-    """Descend from one start after the other, until one comes near the bound or two agree.
-
-    Returns the best schedules (each from time 0), why their descent stopped, and the steps taken.
-    """
-    wanted, tolerance = task.wanted, task.wanted.tolerance
-    for at in task.traced:
-        if int(at.table.status) != Status.OK:
-            why = f"the wire cannot be followed: {Status(int(at.table.status)).label}"
-            return [evenly(t, np.zeros((wanted.knots, 2))) for t in task.durations], why, []
-    begins = guesses(task.traced, task.durations, wanted.knots, TORQUE_SHARE)
-    weakest = int(np.argmin(task.bounds))
-    if task.bounds[weakest] <= 0:
-        where = 100 * float(task.tops[weakest].share)
-        why = f"no torque within limits holds this formation at {where:.0f} % of its wire"
-        return _schedules(task, begins[0]), why, []
-    if task.begin is not None and not task.begin.share > 0:
-        return _schedules(task, begins[0]), "no torque lets this formation take over at the limited rate", []
-    problem, method, found, history = task.problem(_limits(task)), _method(wanted.optimiser, len(task.phases)), [], []
-    for number, start in enumerate(begins):
-        for at, torque in task.pins.items():
-            start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[at].set(torque))
-        p, why, taken = descend(problem, start, number, method, wanted.callback)
-        history += taken
-        fine, share = _honest(scene, task, p)
-        best = max((other for ok, other, *_ in found if ok), default=np.nan)
-        agree = fine and abs(share - best) <= tolerance
-        found.append((fine, share, why, p))
-        if agree or (fine and share >= GOOD * task.most):
-            break
-    fine, share, why, p = max(found, key=lambda one: one[:2])
-    return (
-        _schedules(task, p),
-        f"within {tolerance:g} of the bound" if fine and share >= 1 - tolerance else why,
-        history,
-    )
-
-
 @functools.cache
 def _ahead(phases: int, knots: int, rows: int, method) -> Future[None]:
     beside = ThreadPoolExecutor(1)
@@ -341,72 +231,15 @@ def _ahead(phases: int, knots: int, rows: int, method) -> Future[None]:
 def _compile(phases: int, knots: int, rows: int, method) -> None:
     """Run the descent's programs once, on blank tables."""
     table = blank(Resolution())
-    tables = _stacked([table] * phases)
+    tables = stacked_tables([table] * phases)
     each = np.ones(phases)
-    plain = (np.full(2, np.inf), each, each, 0 * _ONE, np.zeros((phases, knots), bool), each)
+    plain = (np.full(2, np.inf), each, each, np.zeros(()), np.zeros((phases, knots), bool), each)
     limits = Limits(*(array(a) for a in plain))
     empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
     p = Variables(*(array(a) for a in empty))
     advance(begin(p, method), tables, limits, HOW, method)
     zero, one = array(0.0), array(1.0)
-    run(table, padded(evenly(1.0, empty[0][0]), rows), zero, one, _accurately(knots), "rest")
-
-
-@functools.cache
-def _method(optimiser, phases: int):
-    """One transformation for every use, so that programs are not compiled again."""
-    return interior_point(phases) if optimiser is None else projected(optimiser)
-
-
-_ONE = np.ones(())
-
-
-_stacked = jax.jit(stacked)
-
-
-def _schedules(task: _Task, p: Variables) -> list[Torque]:
-    """Each phase's schedule, from time 0."""
-    values, lengths = np.asarray(p.torque) * task.limits[:, None], np.exp(np.asarray(p.log_duration))
-    first, *others = [evenly(length, rows) for length, rows in zip(lengths, values, strict=True)]
-    if task.begin is not None and task.begin.lead > 0:
-        times = np.append(0.0, task.begin.lead + np.asarray(first.times))
-        first = Torque(array(times), array(np.vstack([task.begin.torque, first.values])))
-    return [first, *others]
-
-
-def _honest(scene: Scene, task: _Task, p: Variables) -> tuple[bool, float]:
-    """Whether a simulation of the schedules says `ok`, holds included, and the least margin over its bound."""
-    start, shares, fine, arriving = 0.0, [], [], None
-    torque = _in_turn(_schedules(task, p))
-    schedule = padded(torque, task.wanted.rows)
-    ends = np.cumsum(np.exp(np.asarray(p.log_duration)) + task.lead)
-    for phase, at, end, top in zip(task.phases, task.traced, ends, task.bounds, strict=True):
-        one = run(at.table, schedule, start, end - start, _accurately(task.wanted.knots), phase.arrive, arriving)
-        start += float(one.duration) * float(np.asarray(one.motion.share)[int(one.motion.count)])
-        arriving = one.leaving if phase.arrive == "moving" else None
-        held = stays(scene, torque, phase, at, one)
-        fine.append(int(one.verdict.status) == Status.OK and all(h.lost is None for h in held))
-        shares.append(float(one.score.margin) / top)
-    least = min(shares)
-    return all(fine), least if np.isfinite(least) else -np.inf
-
-
-def _in_turn(schedules: list[Torque]) -> Torque:
-    """Schedules one after the other; a step where one follows another."""
-    begins = np.cumsum([0.0, *(float(np.asarray(s.times)[-1]) for s in schedules[:-1])])
-    times = [begin + np.asarray(s.times) for begin, s in zip(begins, schedules, strict=True)]
-    return Torque(*(array(np.concatenate(rows)) for rows in (times, [np.asarray(s.values) for s in schedules])))
+    run(table, padded(evenly(1.0, empty[0][0]), rows), zero, one, with_room(Integration(), knots), "rest")
 
 
 _bound = Program(bound)
-
-
-def _limits(task: _Task) -> Limits:
-    lengths, asked = task.durations, task.wanted
-    shortest, longest = (lengths, lengths) if asked.durations is None else (t - task.lead for t in asked.durations)
-    rate = np.full(2, np.inf if asked.rate_limit is None else float(asked.rate_limit))
-    pinned = np.zeros((len(lengths), asked.knots), bool)
-    for at in task.pins:
-        pinned[at] = True
-    shortest, unit = np.maximum(shortest, SHORTEST * longest), np.maximum(task.bounds, 1e-300)
-    return Limits(*(array(a) for a in (rate, shortest, longest, asked.passing * _ONE, pinned, unit)))

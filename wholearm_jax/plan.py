@@ -28,9 +28,9 @@ from wholearm_jax.precision import array, digits, require_x64
 from wholearm_jax.programs import transformed
 from wholearm_jax.result import Result, describe
 from wholearm_jax.scene import Body, Phase, Scene, body
-from wholearm_jax.schedule import Torque, has_steps, padded, rounded
+from wholearm_jax.schedule import Torque, has_steps, padded
 from wholearm_jax.status import Status
-from wholearm_jax.stepping import Integration, tolerance_as_data
+from wholearm_jax.stepping import Integration, tolerance_as_data, with_room
 from wholearm_jax.verdict import ARRIVAL, GOALS
 from wholearm_jax.wire import Resolution
 
@@ -280,7 +280,7 @@ def simulate(
 
 
 def roomy(how: Integration, scene: Scene, torque: Torque) -> Integration:
-    """The same integration with room for a step at every row of a schedule, and for as many more as it has.
+    """The same integration with room for the steps of a phase under a schedule (`stepping.with_room`).
 
     Counted are the rows within a phase, or all where times or durations are being transformed.
     """
@@ -288,7 +288,7 @@ def roomy(how: Integration, scene: Scene, torque: Torque) -> Integration:
     if not transformed(torque.times, [phase.duration for phase in scene.phases]):
         ends = np.cumsum([0.0, *(float(phase.duration) for phase in scene.phases)])
         rows = int(np.max(np.diff(np.searchsorted(np.asarray(torque.times), ends))))
-    return replace(how, max_steps=max(how.max_steps, rounded(2 * rows, how.max_steps)))
+    return with_room(how, rows)
 
 
 def steps_within(scenes: Scene, torque: Torque) -> bool:

@@ -12,8 +12,6 @@ from wholearm_jax.lookup import pick
 from wholearm_jax.precision import array
 
 ROWS = 128  # schedules are padded to a multiple of this: those of like length share compiled programs
-
-
 ROUNDING = 16  # times beside each other by this many of a precision's last digits are one
 
 
@@ -66,6 +64,13 @@ def torque(times, values) -> Torque:
 def evenly(duration, values) -> Torque:
     """A schedule of evenly spaced rows from time 0."""
     return Torque(array(np.linspace(0.0, float(duration), len(values))), array(values))
+
+
+def in_turn(schedules: list[Torque]) -> Torque:
+    """Schedules one after the other, each from time 0; a step where one follows another."""
+    begins = np.cumsum([0.0, *(float(np.asarray(s.times)[-1]) for s in schedules[:-1])])
+    times = [begin + np.asarray(s.times) for begin, s in zip(begins, schedules, strict=True)]
+    return Torque(*(array(np.concatenate(rows)) for rows in (times, [np.asarray(s.values) for s in schedules])))
 
 
 def has_steps(schedule: Torque, start: float, end: float) -> bool:

@@ -7,6 +7,7 @@ nothing else is watched, saved or compiled. By `diffrax.diffeqsolve` a motion co
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import diffrax as dfx
@@ -19,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.lookup import pick
 from wholearm_jax.precision import array
-from wholearm_jax.schedule import Window, interval
+from wholearm_jax.schedule import Window, interval, rounded
 
 Loop = Literal["lax", "checkpointed", "bounded"]
 LOOPS: dict[str, Loop] = {"none": "lax", "forward": "lax", "reverse": "checkpointed", "both": "bounded"}
@@ -48,6 +49,11 @@ class Integration(eqx.Module):
 def tolerance_as_data(how: Integration, dtype) -> Integration:
     """The same integration, with a tolerance that is an array: all tolerances share a program."""
     return eqx.tree_at(lambda h: h.tolerance, how, array(how.tolerance, dtype))
+
+
+def with_room(how: Integration, rows: int) -> Integration:
+    """The same integration with room for a step at each of so many rows of a schedule, and for as many more."""
+    return replace(how, max_steps=rounded(2 * max(rows, 1), how.max_steps))
 
 
 class Steps(NamedTuple):
