@@ -33,7 +33,7 @@ ORDER = (
     *("formations", "guesses", "handover", "group", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),
     *("free_bodies", "execution", "perturbation"),
-    *("scene_file", "result_file", "store", "polygon_file", "palette", "report"),
+    *("outline", "scene_file", "result_file", "store", "polygon_file", "palette", "report"),
     *("drawing", "execution_drawing", "survey_drawing", "__init__"),
     *("arguments", "batch_command", "execution_command", "command"),
 )

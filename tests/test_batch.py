@@ -250,6 +250,9 @@ def test_scenes_that_vary_arrive_as_the_command_line_says():
     assert inspect.signature(wa.check).parameters["arrival"].default == batch_command.ARRIVAL
 
 
+SEVEN = np.array([[2.0, 0], [1, 1.6], [-0.4, 1.9], [-1.8, 0.9], [-1.8, -0.9], [-0.4, -1.9], [1.2, -1.6]])
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -257,6 +260,14 @@ def test_scenes_that_vary_arrive_as_the_command_line_says():
         (b"PK\x03\x04 cut short", "not a NumPy .npz file"),
         ({"vertices": np.full((1, 3, 2), "a")}, "vertices: needs real numbers"),
         ({"vertices": np.ones((1, 3, 2), complex)}, "vertices: needs real numbers"),
+        ({"vertices": np.stack([SEVEN, np.where(SEVEN > 1, np.nan, SEVEN)])}, r"vertices\[1\]: not finite"),
+        ({"vertices": np.stack([SEVEN, SEVEN, SEVEN[::-1]])}, r"vertices\[2\]: clockwise"),
+        ({"vertices": np.stack([SEVEN, SEVEN[[0, 1, 2, 3, 5, 4, 6]]])}, r"vertices\[1\]: edges 3 and 5 cross"),
+        ({"vertices": np.stack([SEVEN, SEVEN[[0, 1, 1, 2, 3, 4, 5]]])}, r"vertices\[1\]: .* vertices 1 and 2 coincide"),
+        (
+            {"vertices": np.stack([SEVEN, SEVEN[::-1]])[[0, 1, 0]], "count": np.array([6, 5, 7])},
+            r"vertices\[1\]: clockwise",
+        ),
     ],
 )
 def test_files_of_polygons_that_are_none(tmp_path, scene, content, said):

@@ -89,7 +89,8 @@ def test_a_plan_without_motion(folder):
 BAD = {
     "no summary": ("summary.json", None, "no such file"),
     "not JSON": ("summary.json", "{", "cannot be read"),
-    "another JSON": ("summary.json", "[1]", "missing key status"),
+    "another JSON": ("summary.json", "[1]", "must be a table; it is not a summary"),
+    "deep JSON": ("summary.json", "[" * 100_000, "cannot be read"),
     "no trajectory": ("trajectory.csv", None, "no such file"),
     "empty trajectory": ("trajectory.csv", "", "line 1: the header must be t,phase,x"),
     "another table": ("trajectory.csv", "t,x\n1,2\n", "line 1: the header must be t,phase,x"),
@@ -124,6 +125,45 @@ def test_summary_of_another_scene(copied):
     (copied / "summary.json").write_text(json.dumps(content))
     with pytest.raises(SceneError, match="phases are not those of its scene"):
         report(copied)
+
+
+SPOILT = {
+    "status": (3, "status: must be text, not 3"),
+    "margin": ("5", "margin: must be a number, not '5'"),
+    "message": (None, "message: must be text"),
+    "phases": (None, "phases: must be a list"),
+    "scene": ([], "scene: must be a table"),
+}
+
+
+@pytest.mark.parametrize(("key", "value", "cause"), [(key, *rest) for key, rest in SPOILT.items()], ids=SPOILT.keys())
+def test_a_summary_with_something_else_in_it(key, value, cause, copied):
+    content = json.loads((copied / "summary.json").read_text())
+    (copied / "summary.json").write_text(json.dumps(content | {key: value}))
+    with pytest.raises(SceneError) as caught:
+        report(copied)
+    assert str(caught.value).startswith(f"{copied / 'summary.json'}: {cause}")
+
+
+PHASE_SPOILT = {
+    "status": ("fine", "phases[1].status: 'fine' is unknown"),
+    "contacts": (["palm:v5", 4], "phases[1].contacts[1]: must be text, not 4"),
+    "duration": (0.0, "phases[1].duration: must be greater than 0, not 0.0"),
+    "margin": (float("nan"), "phases[1].margin: must be finite"),
+    "margin_time": ([], "phases[1].margin_time: must be a number"),
+}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "cause"), [(key, *rest) for key, rest in PHASE_SPOILT.items()], ids=PHASE_SPOILT.keys()
+)
+def test_a_phase_with_something_else_in_it(key, value, cause, copied):
+    content = json.loads((copied / "summary.json").read_text())
+    content["phases"][1][key] = value
+    (copied / "summary.json").write_text(json.dumps(content))
+    with pytest.raises(SceneError) as caught:
+        report(copied)
+    assert str(caught.value).startswith(f"{copied / 'summary.json'}: {cause}")
 
 
 # --- in a browser ----------------------------------------------------------------------------------------------------

@@ -242,6 +242,32 @@ def test_write_whole_leaves_nothing_behind(error, existing, tmp_path, monkeypatc
     assert not existing or path.read_text() == "old"
 
 
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o444])
+def test_write_whole_keeps_permissions(mode, tmp_path):
+    path = tmp_path / "file"
+    path.write_text("old")
+    path.chmod(mode)
+    write_whole(path, "new")
+    assert path.read_text() == "new"
+    assert path.stat().st_mode & 0o777 == mode
+
+
+def test_write_whole_gives_a_new_file_the_permissions_of_any(tmp_path):
+    write_whole(tmp_path / "ours", "new")
+    (tmp_path / "any").write_text("new")
+    assert (tmp_path / "ours").stat().st_mode == (tmp_path / "any").stat().st_mode
+
+
+def test_write_whole_writes_the_file_behind_a_link(tmp_path):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "file").write_text("old")
+    (tmp_path / "link").symlink_to("far/file")
+    write_whole(tmp_path / "link", "new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "far" / "file").read_text() == "new"
+    assert sorted(os.listdir(tmp_path)) == ["far", "link"]
+
+
 def test_write_whole_onto_a_folder(tmp_path):
     (tmp_path / "file").mkdir()
     with pytest.raises(OSError, match="file"):

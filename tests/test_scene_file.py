@@ -314,6 +314,19 @@ def test_not_toml(tmp_path):
     assert "line 1" in message
 
 
+def test_nested_beyond_what_can_be_read(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(f"gravity = {'[' * 100_000}{']' * 100_000}\n")
+    assert refused(path).startswith(f"{path}: not valid TOML: ")
+
+
+@pytest.mark.parametrize("digits", [400, 5000])
+def test_numbers_beyond_any_float(digits, tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(f"gravity = 1{'0' * digits}\n")
+    assert refused(path).startswith(f"{path}: ")
+
+
 def test_missing_file_names_the_nearest_bundled_scene():
     assert refused("heptagn") == "heptagn: no such file; did you mean the bundled scene 'heptagon'?"
 

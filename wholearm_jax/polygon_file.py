@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from wholearm_jax.batch import Given
+from wholearm_jax.outline import first_flaw
 from wholearm_jax.scene import Polygon, Scene
 from wholearm_jax.scene_file import SceneError
 
@@ -36,12 +37,9 @@ def read_polygons(path: Path, scene: Scene) -> Given:
     count = held.get("count", np.full(many, width))
     if count.shape != (many,) or count.dtype.kind not in "iu" or count.min() < 3 or count.max() > width:
         raise SceneError(f"{path}: count: needs one whole number of 3 to {width} a polygon")
+    _outlines(path, given, count)
     rows = np.minimum(np.arange(width + (-width % 8)), count[:, None] - 1)  # rows that pad repeat the last vertex
     vertices = np.take_along_axis(np.asarray(given, float), rows[:, :, None], axis=1)
-    turned = np.roll(vertices, -1, axis=1)  # edges of padding have no length
-    area = (vertices[..., 0] * turned[..., 1] - vertices[..., 1] * turned[..., 0]).sum(1)
-    if not np.all(area > 0):
-        raise SceneError(f"{path}: vertices[{int(np.argmin(area > 0))}]: not a polygon with anticlockwise vertices")
     mass = _positive(path, "mass", held, (many,), np.asarray(scene.object.mass), strictly=True)
     friction = held.get("friction", np.asarray(scene.object.friction))
     friction = friction[:, None] if friction.shape == (many,) else friction
@@ -50,6 +48,19 @@ def read_polygons(path: Path, scene: Scene) -> Given:
     shape = Polygon(vertices=vertices, count=count, mass=mass, friction=friction)  # pyright: ignore
     alike = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (many, *np.shape(leaf))), scene)
     return Given(Scene(scene.title, alike.gravity, alike.hand, shape, alike.start, alike.phases))
+
+
+def _outlines(path, vertices, count) -> None:
+    """Every row of vertices must be a polygon."""
+    for size in np.unique(count):
+        which = np.flatnonzero(count == size)
+        chosen = vertices[which, :size]
+        finite = np.isfinite(chosen).all((1, 2))
+        if not finite.all():
+            raise SceneError(f"{path}: vertices[{which[np.argmin(finite)]}]: not finite")
+        flaw = first_flaw(np.asarray(chosen, float))
+        if flaw is not None:
+            raise SceneError(f"{path}: vertices[{which[flaw[0]]}]: {flaw[1]}")
 
 
 def _positive(path, name: str, held, shape, otherwise, *, strictly: bool):

@@ -11,12 +11,13 @@ import itertools
 import json
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
 import tomli_w
 from jinja2 import Environment, PackageLoader
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from wholearm_jax.contacts import contacts, frames
 from wholearm_jax.palette import (
@@ -29,13 +30,44 @@ from wholearm_jax.palette import (
 )
 from wholearm_jax.result_file import TRAJECTORY_COLUMNS, read_torque
 from wholearm_jax.scene import COORDINATES, Scene, body, parse_contact
-from wholearm_jax.scene_file import SceneError, parse
+from wholearm_jax.scene_file import Positive, SceneError, explain, parse
 from wholearm_jax.schedule import Torque
 from wholearm_jax.status import Status
 
 DASH = "\N{EN DASH}"  # for what is undefined
-_NEEDED = ("status", "margin", "message", "phases", "scene")
-_PHASE_NEEDED = ("name", "contacts", "status", "duration", "margin", "margin_time", "margin_contact", "bound")
+
+
+def _label(status: str) -> str:
+    if status.upper() not in Status.__members__:
+        raise ValueError(f"'{status:.40}' is unknown")
+    return status
+
+
+Label = Annotated[str, AfterValidator(_label)]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
+
+
+class _PhaseRow(BaseModel):
+    """What a page needs of a phase's row in a summary, which may hold more."""
+
+    name: str
+    contacts: list[str]
+    status: Label
+    duration: Positive
+    margin: Number
+    margin_time: Number
+    margin_contact: str | None
+    bound: Number
+
+
+class _Summary(BaseModel):
+    """What it needs of the whole."""
+
+    status: Label
+    margin: Number
+    message: str
+    phases: list[_PhaseRow]
+    scene: dict[str, Any]
 
 
 class Written(NamedTuple):
@@ -166,20 +198,13 @@ def _read_summary(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file; optimise, simulate and search write it with --out") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    _demand(content, _NEEDED, path)
-    for row in content["phases"]:
-        _demand(row, _PHASE_NEEDED, path)
-    if content["status"].upper() not in Status.__members__:
-        raise SceneError(f"{path}: status: '{content['status']}' is unknown")
+    try:
+        _Summary.model_validate(content)
+    except ValidationError as error:
+        raise SceneError(f"{path}: {explain(error)}; it is not a summary that this library wrote") from None
     return content
-
-
-def _demand(table, keys, path: Path) -> None:
-    missing = [key for key in keys if not isinstance(table, dict) or key not in table]
-    if missing:
-        raise SceneError(f"{path}: missing key {missing[0]}; it is not a summary that this library wrote")
 
 
 def _read_trajectory(path: Path, names: list[str]) -> dict[str, np.ndarray]:

@@ -21,6 +21,7 @@ from pydantic import (
     model_validator,
 )
 
+from wholearm_jax.outline import first_flaw
 from wholearm_jax.precision import array
 from wholearm_jax.scene import COORDINATES, LINKS, Hand, Phase, Scene, formation, heading, parse_contact, polygon
 from wholearm_jax.writing import write_whole
@@ -75,54 +76,16 @@ class _Frictions(_Strict):
     finger2: NonNegative
 
 
-def _simple_anticlockwise(vertices: list[Pair]) -> list[Pair]:
-    """Refuse polygons that have no area, run clockwise, repeat a vertex or cross themselves."""
-    points = np.asarray(vertices)
-    size = np.ptp(points, axis=0).max()
-    for k, edge in enumerate(np.roll(points, -1, 0) - points):
-        if np.hypot(*edge) <= 1e-9 * size:
-            raise ValueError(f"degenerate: vertices {k} and {(k + 1) % len(points)} coincide")
-    points = points - points.mean(0)
-    if np.linalg.svd(points, compute_uv=False)[1] <= 1e-9 * size:
-        raise ValueError("degenerate: the vertices lie on one line, the polygon has no area")
-    crossing = _crossing(points)
-    if crossing is not None:
-        raise ValueError("edges {} and {} cross or touch: the polygon intersects itself".format(*crossing))
-    following = np.roll(points, -1, 0)
-    if (points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum() < 0:
-        raise ValueError("clockwise: give the vertices anticlockwise")
+def _polygon(vertices: list[Pair]) -> list[Pair]:
+    """Refuse vertices that make no polygon."""
+    flaw = first_flaw(np.asarray(vertices)[None])
+    if flaw is not None:
+        raise ValueError(flaw[1])
     return vertices
 
 
-def _crossing(points: np.ndarray) -> tuple[int, int] | None:
-    """The first two edges that touch without being neighbours, or fold back on each other."""
-    count = len(points)
-
-    def side(a, b, c):
-        return np.sign((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
-
-    def within(a, b, c):
-        return min(a[0], b[0]) <= c[0] <= max(a[0], b[0]) and min(a[1], b[1]) <= c[1] <= max(a[1], b[1])
-
-    for i in range(count):
-        a, b = points[i], points[(i + 1) % count]
-        for j in range(i + 1, count):
-            c, d = points[j], points[(j + 1) % count]
-            if j == i + 1 or (i == 0 and j == count - 1):
-                shared, one, other = (b, a, d) if j == i + 1 else (a, b, c)
-                if side(one, shared, other) == 0 and (one - shared) @ (other - shared) > 0:
-                    return i, j
-                continue
-            turns = side(a, b, c), side(a, b, d), side(c, d, a), side(c, d, b)
-            proper = turns[0] * turns[1] < 0 and turns[2] * turns[3] < 0
-            pairs = ((turns[0], a, b, c), (turns[1], a, b, d), (turns[2], c, d, a), (turns[3], c, d, b))
-            if proper or any(turn == 0 and within(*ends) for turn, *ends in pairs):
-                return i, j
-    return None
-
-
 class _Object(_Strict):
-    vertices: Annotated[list[Pair], Field(min_length=3), AfterValidator(_simple_anticlockwise)]
+    vertices: Annotated[list[Pair], Field(min_length=3), AfterValidator(_polygon)]
     mass: Positive
     friction: Annotated[
         Annotated[NonNegative, Tag(_NUMBER)] | Annotated[_Frictions, Tag(_SEVERAL)], Discriminator(_tag)
@@ -239,7 +202,7 @@ def load(name: str | Path) -> Scene:
         raise SceneError(f"{path}: no such file{hint}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise SceneError(f"{path}: not valid TOML: {error}") from None
     return parse(data, str(path))
 
@@ -260,7 +223,7 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
     try:
         checked = _Scene.model_validate(data)
     except ValidationError as error:
-        raise SceneError(f"{source}: {_explain(error)}") from None
+        raise SceneError(f"{source}: {explain(error)}") from None
     fingers = (checked.hand.finger1, checked.hand.finger2)
     shape, friction = checked.object, checked.object.friction
     each = friction if isinstance(friction, float) else [getattr(friction, link) for link in LINKS]
@@ -295,7 +258,7 @@ _WORDS = {
 }
 
 
-def _explain(error: ValidationError) -> str:
+def explain(error: ValidationError) -> str:
     """One complaint in one line: the key, what is wrong, and for an unknown key the nearest known one.
 
     The first complaint, but an unknown key before any other: what is missing is then often only misspelt.
