@@ -21,7 +21,7 @@ from wholearm_jax.execution import Ending, Tolerance, clock, drive, execute, jud
 from wholearm_jax.execution_drawing import animate, draw_execution, draw_execution_strip
 from wholearm_jax.free_bodies import _wedges, free_bodies
 from wholearm_jax.perturbation import Amounts, _perturbed, perturb, start_near, wilson
-from wholearm_jax.scene import body, formation
+from wholearm_jax.scene import body, formation, parse_contact
 from wholearm_jax.system import system
 
 DATA = Path(__file__).parent / "data"
@@ -86,6 +86,21 @@ def test_free_fall_and_free_fingers(predictions):
     turned = drive_ / np.asarray(hand.viscous) * (t - (1 - np.exp(-rate * t)) / rate)
     np.testing.assert_allclose(course.z[-1, 3:] - start[3:], turned, rtol=3e-3)
     assert not course.cn.any()
+
+
+def test_every_link_and_joint_has_its_own_friction(predictions):
+    scene = predictions["heptagon"].scene
+    mu, dry, viscous = np.array([0.1, 0.2, 0.4]), np.array([0.01, 0.03]), np.array([0.02, 0.05])
+    scene = eqx.tree_at(
+        lambda s: (s.object.friction, s.hand.dry, s.hand.viscous), scene, tuple(map(jnp.asarray, (mu, dry, viscous)))
+    )
+    bodies = free_bodies(scene, 1e-4)
+    assert bodies.model.npair == len(bodies.names)
+    for name in bodies.names:
+        assert list(bodies.model.pair(name).friction[:2]) == [mu[parse_contact(name)[0]]] * 2
+    np.testing.assert_array_equal(np.ravel(bodies.model.dof_frictionloss), [0, 0, 0, *dry])
+    for joint, expected in zip(("theta1", "theta2"), viscous, strict=True):
+        assert bodies.model.joint(joint).damping[0] == expected
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 import wholearm_jax as wa
 from wholearm_jax.execution import Ending, execute
@@ -21,15 +22,17 @@ HALF, MASS, MU, DRY, LIMIT = 0.03, 0.2, 0.3, 0.01, 1.0
 WEIGHT, HEIGHT = MASS * 9.81, 2 * HALF
 
 
-def block(friction=MU, dry=DRY, mass=MASS):
+def block(friction=MU, dry=(DRY, DRY), mass=MASS, limits=(LIMIT, LIMIT)):
     """A square on the palm; upright fingers, whose joints lie below its sides, touch its upper corners."""
-    finger = {"length": 0.1, "inertia": 2e-3, "dry": dry, "torque_limit": LIMIT}
+    right, left = (
+        {"length": 0.1, "inertia": 2e-3, "dry": d, "torque_limit": top} for d, top in zip(dry, limits, strict=True)
+    )
     contacts = ["palm:v0", "palm:v1", "finger1:v2", "finger2:v3"]
     return wa.parse(
         {
             "title": "block",
             "gravity": 9.81,
-            "hand": {"finger1": finger | {"joint": [HALF, 0.0]}, "finger2": finger | {"joint": [-HALF, 0.0]}},
+            "hand": {"finger1": right | {"joint": [HALF, 0.0]}, "finger2": left | {"joint": [-HALF, 0.0]}},
             "object": {
                 "vertices": [[-HALF, -HALF], [HALF, -HALF], [HALF, HALF], [-HALF, HALF]],
                 "mass": mass,
@@ -61,21 +64,66 @@ def test_the_best_squeeze_is_at_the_limit():
     assert of_block().support(found.torque).margin == pytest.approx(found.margin, rel=1e-9)
 
 
+@pytest.mark.parametrize("swapped", [False, True])
+def test_each_finger_has_its_own_limit_and_dry_friction(swapped):
+    """A squeeze is `(limit + D) / h` of its finger at most, friction `mu` of its link times the force."""
+    dry, limits, mu = (0.01, 0.03), (0.2, 0.5), {"palm": 0.1, "finger1": 0.2, "finger2": 0.4}
+    if swapped:
+        dry, limits, mu = dry[::-1], limits[::-1], mu | {"finger1": 0.4, "finger2": 0.2}
+    found = of_block(friction=mu, dry=dry, limits=limits).best()
+    assert found.margin == pytest.approx(_least_force(mu, dry, limits), rel=1e-9)
+
+
+def _least_force(mu, dry, limits) -> float:
+    """The largest least normal force of the block at rest, as a linear programme of its eight forces."""
+    # Unknowns: p0, p1, s1, s2 (normal), q0, q1, f1, f2 (friction: of the palm to the right, of the fingers up), level.
+    balance = np.zeros((3, 9))
+    balance[0, [4, 5, 3, 2]] = [1, 1, 1, -1]  # finger 2 pushes to the right, finger 1 to the left
+    balance[1, [0, 1, 6, 7]] = 1
+    balance[2, [0, 1, 6, 7]] = [-HALF, HALF, HALF, -HALF]  # about the centre
+    balance[2, [4, 5, 2, 3]] = [HALF, HALF, HALF, -HALF]
+    rows = []
+    for normal, tangent, coefficient in zip(
+        range(4), range(4, 8), [mu["palm"], mu["palm"], mu["finger1"], mu["finger2"]], strict=True
+    ):
+        for sign in (1.0, -1.0):
+            row = np.zeros(9)
+            row[tangent], row[normal] = sign, -coefficient
+            rows.append((row, 0.0))
+        row = np.zeros(9)
+        row[8], row[normal] = 1.0, -1.0
+        rows.append((row, 0.0))
+    for squeeze, top, stuck in zip((2, 3), limits, dry, strict=True):
+        row = np.zeros(9)
+        row[squeeze] = HEIGHT
+        rows.append((row, top + stuck))
+    answer = linprog(
+        -np.eye(9)[8],
+        A_ub=np.array([row for row, _ in rows]),
+        b_ub=[most for _, most in rows],
+        A_eq=balance,
+        b_eq=[0.0, WEIGHT, 0.0],
+        bounds=[(0, None)] * 4 + [(None, None)] * 5,
+    )
+    assert answer.success
+    return -answer.fun
+
+
 def test_fingers_that_pull_would_have_to_adhere():
     """Without dry friction each finger's pressure is `tau / h`; where that is negative it is the adhesion needed."""
-    found = of_block(dry=0.0).support([-0.03, 0.03])
+    found = of_block(dry=(0.0, 0.0)).support([-0.03, 0.03])
     assert found.margin == pytest.approx(-0.03 / HEIGHT, rel=1e-9)
     assert found.contact.startswith("finger")
 
 
 def test_what_no_adhesion_holds():
     """A push from one side alone, without any friction."""
-    assert of_block(friction=0.0, dry=0.0).support([0.05, -0.02]).margin == -np.inf
+    assert of_block(friction=0.0, dry=(0.0, 0.0)).support([0.05, -0.02]).margin == -np.inf
 
 
 def test_units_do_not_matter():
     """A million times the mass and the torque: a million times the margin."""
-    heavy = of_block(mass=MASS * 1e6, dry=DRY * 1e6)
+    heavy = of_block(mass=MASS * 1e6, dry=(DRY * 1e6, DRY * 1e6))
     small = of_block().support([0.05, -0.04]).margin
     assert heavy.support([0.05e6, -0.04e6]).margin == pytest.approx(1e6 * small, rel=1e-9)
 

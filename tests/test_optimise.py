@@ -62,6 +62,20 @@ def test_the_search_is_beaten_in_margin(optimised):
     assert baseline.result.status is not wa.Status.OK or baseline.result.margin < found.result.margin
 
 
+@pytest.mark.parametrize("limits", [(0.4, 1.5), (1.5, 0.6)])
+def test_each_finger_has_its_own_limit(limits):
+    """The flip's bound is 0.15 and 0.30 N: with limits exchanged it would not be reached, or exceeded."""
+    scene = eqx.tree_at(lambda s: s.hand.torque_limit, wa.load("heptagon"), jnp.asarray(limits))
+    found = wa.optimise(scene, knots=31)
+    assert found.result.status is wa.Status.OK
+    most = np.abs(np.asarray(found.torque.values)).max(0)
+    assert np.all(most <= np.array(limits))
+    assert most.max() > min(limits)
+    slide, flip = found.reached
+    assert 0.99 < slide < 1 + 1e-9
+    assert 0.85 < flip < 1 + 1e-9, "the stronger finger alone would allow five times as much"
+
+
 def test_rate_limits_hold_in_the_result():
     scene = wa.load("hexagon")
     scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
