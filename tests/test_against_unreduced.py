@@ -4,10 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import unreduced
+from scipy.optimize import brentq
 
 import wholearm_jax
 from wholearm_jax import scene_file, squeeze
-from wholearm_jax.phase import run
+from wholearm_jax.phase import run, start_configuration
 from wholearm_jax.sampling import sample
 from wholearm_jax.stepping import Integration
 
@@ -99,6 +100,43 @@ def test_between_steps(name, phase):
     assert z < 1e-9
     assert z_dot < 1e-7
     assert cn < 1e-7
+
+
+@pytest.mark.parametrize("phase", [0, 1])
+@pytest.mark.parametrize("name", SCENES)
+def test_the_moment_of_a_loss(name, phase):
+    """Too weak a squeeze for a while: the plan arrives, but is lost where the other simulation's force turns tensile."""
+    scene = SCENES[name]()
+    table = wholearm_jax.trace(scene)[phase].table
+    torque = passing(table)
+    knot, middle = 3, table.breaks[0] + 0.15 * table.length
+    motion_by, _ = (np.asarray(terms) for terms in squeeze.coefficients(table, middle))
+    along = np.array([-motion_by[4], motion_by[3]]) / np.hypot(*motion_by[3:])  # torques that leave the motion alone
+
+    def outcome(amount):
+        weaker = wholearm_jax.Torque(torque.times, torque.values.at[knot].add(amount * along))
+        return weaker, run(table, weaker, 0.0, DURATION, Integration(tolerance=1e-12), "caught")
+
+    weaker, found = max((outcome(amount) for amount in (-1.5, 1.5)), key=lambda one: np.isfinite(one[1].score.lost))
+    assert int(found.motion.status) == wholearm_jax.Status.LEFT_FORMATION
+    assert wholearm_jax.Status(int(found.verdict.status)) is wholearm_jax.Status.CONTACT_LOST
+    lost, last = float(found.score.lost), float(found.motion.share[found.motion.count])
+    assert 0.05 < lost < 0.6 < last
+
+    data = scene_file.to_dict(scene)
+    model = unreduced.Model(data, data["phase"][phase]["contacts"])
+    begin = np.asarray(start_configuration(table))
+    times, values = np.asarray(weaker.times), np.asarray(weaker.values)
+    until = (lost + 0.01) * DURATION  # tensile forces soon make no sense of friction
+    followed = model.simulate(begin, data["phase"][phase]["toward"], times, values, until)
+    grid = np.linspace(0.0, until, 400)
+    tensile = np.array([followed.at(t)[2].min() for t in grid]) < 0
+    first = int(np.argmax(tensile))
+    assert first > 0
+    moment = brentq(lambda t: followed.at(t)[2].min(), grid[first - 1], grid[first], xtol=1e-14)
+    contact = int(np.argmin(followed.at(moment)[2]))
+    assert lost * DURATION == pytest.approx(moment, abs=1e-8)
+    assert int(found.score.lost_contact) == int(found.verdict.contact) == contact
 
 
 @pytest.mark.parametrize("contacts", [("palm:v5", "finger1:v1", "finger2:e3", "finger1:e0")])
