@@ -105,7 +105,7 @@ def test_between_steps(name, phase):
 @pytest.mark.parametrize("phase", [0, 1])
 @pytest.mark.parametrize("name", SCENES)
 def test_the_moment_of_a_loss(name, phase):
-    """Too weak a squeeze for a while: the plan arrives, but is lost where the other simulation's force turns tensile."""
+    """Too weak a squeeze for a while: the plan arrives, but is lost when the other simulation says so."""
     scene = SCENES[name]()
     table = wholearm_jax.trace(scene)[phase].table
     torque = passing(table)
