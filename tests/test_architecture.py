@@ -35,7 +35,7 @@ ORDER = (
     *("free_bodies", "execution", "perturbation"),
     *("outline", "scene_file", "result_file", "store", "polygon_file", "palette", "report"),
     *("drawing", "execution_drawing", "survey_drawing", "__init__"),
-    *("arguments", "batch_command", "execution_command", "command"),
+    *("arguments", "finishing", "batch_command", "robust_command", "execution_command", "command"),
 )
 
 

@@ -57,6 +57,16 @@ def test_each_scene_is_what_simulate_says_of_it_alone(ensemble, schedule, checke
         assert_as_alone(checked, ensemble, schedule, number)
 
 
+def test_margins_are_right_to_what_is_said_by_default(ensemble, schedule, checked):
+    """A coarser level computes them: 1e-6 N, and all else to as many digits; not the same numbers."""
+    quick = wa.check(ensemble, schedule, count=COUNT, arrival=ARRIVAL)
+    np.testing.assert_array_equal(quick.status, checked.status)
+    np.testing.assert_array_equal(quick.contact, checked.contact)
+    np.testing.assert_allclose(quick.margin, checked.margin, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(quick.end, checked.end, rtol=0, atol=1e-6)
+    assert np.any(quick.margin != checked.margin), "it is no test of another level"
+
+
 def test_scenes_with_the_same_wires_side_by_side_are_what_they_are_alone(scene, schedule):
     loose = vary(scene, {"friction": "10%", "mass": "5%"}, seed=SEED)
     assert loose.same_wires

@@ -187,7 +187,7 @@ def test_contacts_that_cannot_all_touch(change, key, contact, cause, wholearm, z
     assert_bad_input(answer, f"{path}: {key}: {contact}", "cannot touch", cause, "stays open")
 
 
-@pytest.mark.parametrize("option", [("--rate-limit", 0.5), ("--passing", 0.5), ("--report",)])
+@pytest.mark.parametrize("option", [("--rate-limit", 0.5), ("--passing", 0.5)])
 def test_what_robust_does_not_know(option, wholearm, tmp_path):
     answer = wholearm("optimise", "heptagon", "--robust", "friction=20%", *option, "--out", tmp_path)
     assert_bad_input(answer, f"--robust: knows no {option[0]}")

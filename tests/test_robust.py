@@ -1,5 +1,6 @@
 """A schedule for a sample of scenes does better on scenes that it has not seen than one for the nominal scene."""
 
+import json
 from pathlib import Path
 
 import equinox as eqx
@@ -11,13 +12,23 @@ from wholearm_jax.variation import vary
 
 
 @pytest.fixture(scope="module")
-def found():
+def slide():
     plan = wa.load("heptagon")
-    slide = eqx.tree_at(lambda s: s.phases, plan, plan.phases[:1])
+    return eqx.tree_at(lambda s: s.phases, plan, plan.phases[:1])
+
+
+@pytest.fixture(scope="module")
+def told():
+    return []
+
+
+@pytest.fixture(scope="module")
+def found(slide, told):
     both = wa.read_torque(Path(__file__).parent / "data" / "heptagon_torque.csv")
     nominal = wa.torque(both.times[:51], both.values[:51])
+    varied = vary(slide, {"friction": "20%"}, seed=1)
     return optimise_robustly(
-        vary(slide, {"friction": "20%"}, seed=1), samples=12, steps=40, arrival=0.02, nominal=nominal
+        varied, samples=12, steps=40, arrival=0.02, nominal=nominal, callback=lambda *one: told.append(one)
     )
 
 
@@ -34,3 +45,35 @@ def test_the_worst_margin_of_unseen_scenes_is_larger(found):
 def test_the_best_on_the_samples_is_kept(found):
     nominal, robust = found.seen
     assert (robust.share, robust.margin) > (nominal.share, nominal.margin)
+
+
+def test_every_step_is_told(found, told):
+    assert [step for step, _ in told] == list(range(41))
+    nominal, robust = found.seen
+    assert told[0][1] == nominal
+    assert robust == max((held for _, held in told), key=lambda held: (held.share, held.margin))
+
+
+def test_unseen_scenes_are_others(found):
+    for seen, unseen in zip(found.seen, found.unseen, strict=True):
+        assert seen.margin != unseen.margin
+
+
+def test_what_the_command_writes(slide, wholearm, tmp_path):
+    """A folder as of any plan: the nominal scene under the robust torques, and how many unseen scenes they hold."""
+    wa.save(slide, tmp_path / "slide.toml")
+    vary_by = ("--robust", "friction=20%", "--samples", "12", "--steps", "2", "--seed", "1", "--arrival", "0.02")
+    status, out, _ = wholearm("optimise", tmp_path / "slide.toml", *vary_by, "--report", "--out", tmp_path / "out")
+    lines = out.splitlines()
+    assert lines[0].startswith("12 sampled scenes: nominal ")
+    assert lines[1].startswith("12 unseen scenes: nominal ")
+    assert f"-> {tmp_path / 'out'}" in lines[2]
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names >= {"torque.csv", "trajectory.csv", "summary.json", "report.html", "plan.svg", "result.svg"}
+    told = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert told["command"] == "optimise --robust"
+    assert f"robust {100 * told['unseen_share']:.1f} % hold, worst margin {told['unseen_margin']:.4g} N" in lines[1]
+    assert status == (0 if told["unseen_share"] == 1 else 1)
+    again = wa.simulate(slide, wa.read_torque(tmp_path / "out" / "torque.csv"), arrival=0.02)
+    assert again.margin == told["margin"]
+    assert "share that holds of unseen scenes" in (tmp_path / "out" / "report.html").read_text()

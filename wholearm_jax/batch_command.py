@@ -1,5 +1,4 @@
-"""`wholearm check`: one schedule against very many scenes, in a store that can be gone on with; and
-`wholearm optimise --robust`.
+"""`wholearm check`: one schedule against very many scenes, in a store that can be gone on with.
 
 Every process of a run (`--coordinator`, or SLURM's variables) takes each `--processes`-th chunk; the first one makes
 the store and tells what became of all. Each process has one device for every processor that it may run on.
@@ -120,25 +119,6 @@ class _Job:
         """Rows of the schedule that each scene has for itself; 0 where all follow the given one."""
         scene = self.source.draw(0)
         return self.knots * len(scene.phases) if self.optimise else 0
-
-
-def optimise_robustly(varied, folder: Path | None, samples: int, knots: int, steps: int, arrival: float) -> None:
-    """`wholearm optimise --robust`: write torque.csv, say how it does on seen and unseen scenes, and exit."""
-    from wholearm_jax.result_file import discard, write_torque
-    from wholearm_jax.robust import optimise_robustly as find
-
-    try:
-        found = find(varied, samples=samples, knots=knots, steps=steps, arrival=arrival)
-    except ValueError as error:
-        raise BadInput(f"--robust: {error}") from None
-    for name, (nominal, robust) in (("sampled", found.seen), ("unseen", found.unseen)):
-        told = (f"{100 * h.share:.1f} % hold, worst margin {h.margin:.4g} N" for h in (nominal, robust))
-        print(f"{samples} {name} scenes: nominal {next(told)}; robust {next(told)}")
-    if folder is not None:
-        with writing(f"--out {folder}"):
-            discard(folder)
-            write_torque(found.torque, folder / "torque.csv")
-    sys.exit(0 if found.unseen[1].share == 1.0 else 1)
 
 
 def ensemble(scene, amounts: list[str] | None, seed: int):

@@ -6,7 +6,6 @@ Exit status 0 when the result is `ok`, 1 when the plan fails (its status is prin
 import os
 import sys
 import time
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,9 +23,11 @@ from wholearm_jax.arguments import (
     traced_or_refused,
     writing,
 )
-from wholearm_jax.batch_command import ARRIVAL, check, ensemble, optimise_robustly
+from wholearm_jax.batch_command import ARRIVAL, check, ensemble
 from wholearm_jax.execution_command import execute
+from wholearm_jax.finishing import finish, write_report
 from wholearm_jax.programs import keep
+from wholearm_jax.robust_command import optimise_robustly
 from wholearm_jax.settings import configure
 
 UsageError: Any = typer.BadParameter.__mro__[1]  # of the library beneath, which Typer has under changing names
@@ -102,7 +103,7 @@ def optimise(
     ] = None,
     robust: Annotated[
         list[str] | None,
-        typer.Option(help="QUANTITY=AMOUNT: the best torques for --samples (64) varied scenes; writes torque.csv."),
+        typer.Option(help="QUANTITY=AMOUNT: the best torques for --samples (64) varied scenes."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the varied scenes.")] = 0,
     arrival: Annotated[float, typer.Option(min=1e-9, max=1.0, help="As of `check`, for --robust.")] = ARRIVAL,
@@ -114,11 +115,11 @@ def optimise(
     loaded = scene_of(scene, set_)
     folder = made_folder(out)
     if robust:
-        others = (("rate-limit", rate_limit), ("passing", passing), ("report", report or None))
+        others = (("rate-limit", rate_limit), ("passing", passing))
         unknown = [name for name, value in others if value is not None]
         if unknown:
             raise BadInput(f"--robust: knows no --{unknown[0]}")
-        optimise_robustly(ensemble(loaded, robust, seed), folder, samples or 64, knots, steps, arrival)
+        optimise_robustly(ensemble(loaded, robust, seed), folder, samples or 64, knots, steps, arrival, report)
     samples = samples or 201
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -151,7 +152,7 @@ def optimise(
     more = {"command": "optimise", "knots": knots, "steps": len(found.history), "seconds": seconds}
     more |= {"rate_limit": rate_limit, "passing": passing, "stopped": list(found.stopped)}
     tops = tuple(float(b.value) for b in found.bounds)
-    _finish(found.result, folder, samples, report=report, bounds=tops, **more)
+    finish(found.result, folder, samples, report=report, bounds=tops, **more)
 
 
 @app.command()
@@ -179,7 +180,7 @@ def simulate(
     if check_gradient:
         _check_gradient(loaded, schedule)
     tops = tuple(float(b.value) for b in bounds(loaded, traced=traced))
-    _finish(result, folder, samples, bounds=tops, command="simulate", torque=str(torque), tolerance=tolerance)
+    finish(result, folder, samples, bounds=tops, command="simulate", torque=str(torque), tolerance=tolerance)
 
 
 def _tell(result) -> None:
@@ -276,7 +277,7 @@ def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
     print(f"{found.simulations} simulations in {found.seconds:.2f} s")
     tops = tuple(float(b.value) for b in bounds(found.result.scene, traced=traced))
     more = {"simulations": found.simulations, "seconds": found.seconds}
-    _finish(found.result, folder, samples, bounds=tops, command="search", **more)
+    finish(found.result, folder, samples, bounds=tops, command="search", **more)
 
 
 @app.command()
@@ -287,44 +288,11 @@ def report(
     """Write a result folder's report: one page with an animation, plots and tables, for any browser, offline."""
     path = out or folder / "report.html"
     with writing(str(path)):
-        _write_report(folder, path)
+        write_report(folder, path)
     print(path)
 
 
 app.command()(execute)
-
-
-def _finish(result, folder: Path | None, samples: int, report: bool = False, **more) -> None:
-    """Write the files, say what became of the plan, and exit with its status."""
-    if folder is not None:
-        from wholearm_jax.result_file import discard, summary, write_summary, write_torque, write_trajectory
-
-        with writing(f"--out {folder}"):
-            discard(folder)
-            write_torque(result.torque, folder / "torque.csv")
-            write_trajectory(result, folder / "trajectory.csv", samples)
-            write_summary(summary(result, **more), folder / "summary.json")
-            _draw(result, folder)
-            if report:
-                _write_report(folder, folder / "report.html")
-    print(result.message if not folder else f"{result.message} -> {folder}")
-    sys.exit(0 if result.status.value == 0 else 1)
-
-
-def _write_report(folder: Path, path: Path) -> None:
-    from wholearm_jax.report import report as page
-    from wholearm_jax.writing import write_whole
-
-    write_whole(path, page(folder))
-
-
-def _draw(result, folder: Path) -> None:
-    from wholearm_jax.drawing import draw_result, draw_strip, save_figure
-    from wholearm_jax.sampling import trajectory
-
-    figures = {"plan": draw_strip, "result": draw_result} if trajectory(result) else {}  # no motion, nothing to draw
-    for name, draw in figures.items():
-        save_figure(partial(draw, result), folder, name)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ compression while each phase lasts and the phase ends within a share `arrival` o
 speed that fits (`verdict`); the next phase then starts at rest at the end, as in every plan.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -67,11 +68,13 @@ def optimise_robustly(
     arrival: float = 0.01,
     rate: float = 2e-3,
     nominal: Torque | None = None,
+    callback: Callable[[int, Held], None] | None = None,
 ) -> Robust:
     """Maximise the margin at a low `quantile` (0: the worst) over the first `samples` scenes of an ensemble.
 
     `rate` is the step of Adam as a share of the torque limits. `nominal` starts from another schedule than
-    `optimise(ensemble.scene)` finds. Raises ValueError for a plan that holds its object in a phase.
+    `optimise(ensemble.scene)` finds. `callback` sees each step's number and how its schedule does on the samples.
+    Raises ValueError for a plan that holds its object in a phase.
     """
     scene = ensemble.scene
     require_motion(scene)
@@ -90,10 +93,12 @@ def optimise_robustly(
     share = start.values / limit
     state = adam.init(share)
     best, nominally, best_held = start, None, Held(-1.0, -np.inf)
-    for _ in range(steps + 1):
+    for step in range(steps + 1):
         torque = Torque(start.times, share * limit)
         found = tried(torque, seen)
         now = held(found)
+        if callback is not None:
+            callback(step, now)
         nominally = nominally or now
         if (now.share, now.margin) > (best_held.share, best_held.margin):
             best, best_held = torque, now

@@ -1,0 +1,43 @@
+"""`wholearm optimise --robust`: torques for an ensemble of scenes instead of one."""
+
+import sys
+from pathlib import Path
+
+from wholearm_jax.arguments import BadInput
+from wholearm_jax.finishing import write_result
+
+
+def optimise_robustly(
+    varied, folder: Path | None, samples: int, knots: int, steps: int, arrival: float, report: bool
+) -> None:
+    """Find the torques, say how they do on seen and unseen scenes, write what becomes of the nominal one, and exit."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from wholearm_jax.optimiser import bounds
+    from wholearm_jax.plan import require_motion, simulate
+    from wholearm_jax.robust import optimise_robustly as find
+
+    try:
+        require_motion(varied.scene)
+    except ValueError as error:
+        raise BadInput(f"--robust: {error}") from None
+    columns = (TextColumn("robust"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        bar = progress.add_task("robust", total=steps + 1, state="the nominal schedule")
+
+        def show(step, held):
+            progress.update(bar, completed=step + 1, state=f"{100 * held.share:.0f} % hold, worst {held.margin:.4f} N")
+
+        found = find(varied, samples=samples, knots=knots, steps=steps, arrival=arrival, callback=show)
+    for name, (nominal, robust) in (("sampled", found.seen), ("unseen", found.unseen)):
+        told = (f"{100 * h.share:.1f} % hold, worst margin {h.margin:.4g} N" for h in (nominal, robust))
+        print(f"{samples} {name} scenes: nominal {next(told)}; robust {next(told)}")
+    result = simulate(varied.scene, found.torque, arrival=arrival)
+    nominal, robust = found.unseen
+    more = {"command": "optimise --robust", "knots": knots, "steps": steps, "varied": samples, "arrival": arrival}
+    more |= {"unseen_share": robust.share, "unseen_margin": robust.margin}
+    more |= {"unseen_share_nominal": nominal.share, "unseen_margin_nominal": nominal.margin}
+    tops = tuple(float(b.value) for b in bounds(varied.scene))
+    write_result(result, folder, 201, report, bounds=tops, **more)
+    sys.exit(0 if robust.share == 1.0 else 1)
