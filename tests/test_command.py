@@ -228,7 +228,7 @@ def test_plan_that_fails(wholearm, zero, tmp_path):
     code, printed, err = wholearm("simulate", "heptagon", "--torque", zero, "--out", out, "--samples", 5)
     assert code == 1
     assert err == ""
-    assert printed.startswith("slide left: stuck, t = 1 s")
+    assert printed.startswith("slide left: stuck, t = 1 s, at rest since 0 s: ")
     assert "of it reached" not in printed
     assert {"torque.csv", "trajectory.csv", "summary.json", "plan.png", "result.svg"} <= set(os.listdir(out))
     assert not [name for name in os.listdir(out) if name.startswith(".")]

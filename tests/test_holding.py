@@ -305,3 +305,8 @@ def test_motion_that_stops_holds_and_starts_again():
     for held in rests:
         assert held.lost is None
         assert held.margin > 0
+    (stuck,) = wa.simulate(
+        alone, wa.torque([*times[:6], 1.0], schedule.values[jnp.array([0, 1, 2, 3, 4, 5, 5])])
+    ).phases
+    assert stuck.status is wa.Status.STUCK
+    assert stuck.message.startswith(f"slide left: stuck, t = 1 s, at rest since {rests[0].start:.6g} s: ")

@@ -54,7 +54,9 @@ class PhaseResult:
             return f"{self.name}: ok, margin {self.margin:.4g} N at {self.margin_contact}, t = {self.margin_time:.4g} s"
         whose = f" at {self.contact}" if self.contact else ""
         advice = SLIPPING if self.slips else self.status.advice
-        return f"{self.name}: {self.status.label}{whose}, t = {self.time:.6g} s: {advice}"
+        rests = self.status is Status.STUCK and self.holds
+        since = f", at rest since {self.holds[-1].start:.6g} s" if rests else ""
+        return f"{self.name}: {self.status.label}{whose}, t = {self.time:.6g} s{since}: {advice}"
 
 
 @dataclass(frozen=True)
