@@ -36,7 +36,7 @@ from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.variation import vary
 
 HERE = Path(__file__).parent
-COUNTS = (128, 1024, 8192, 65_536)
+COUNTS = (128, 1024, 8192, 65_536, 1_000_000)
 ALIKE = 65_536
 OPTIMISED = 3
 VARIED = {"vertices": 0.0002, "friction": "10%"}

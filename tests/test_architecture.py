@@ -18,6 +18,7 @@ ORDER = (
         "settings",
         "precision",
         "lookup",
+        "outline",
         "scene",
         "contacts",
         "system",
@@ -33,7 +34,7 @@ ORDER = (
     *("formations", "guesses", "handover", "group", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),
     *("free_bodies", "execution", "perturbation"),
-    *("outline", "scene_file", "result_file", "store", "polygon_file", "palette", "report"),
+    *("scene_file", "result_file", "store", "polygon_file", "palette", "report"),
     *("drawing", "execution_drawing", "survey_drawing", "__init__"),
     *("arguments", "finishing", "batch_command", "robust_command", "execution_command", "command"),
 )

@@ -12,6 +12,7 @@ import wholearm_jax as wa
 from wholearm_jax import batch_command, command
 from wholearm_jax import survey as survey_module
 from wholearm_jax.batch import Checked, check_chunks, from_result
+from wholearm_jax.outline import first_flaw
 from wholearm_jax.polygon_file import read_polygons
 from wholearm_jax.scene_file import SceneError, to_dict
 from wholearm_jax.store import StoreError, fingerprint, identity, open_store
@@ -110,6 +111,40 @@ def test_amounts_that_are_not_are_refused(scene):
     for bad in ({"colour": 1}, {"friction": "ten"}, {"friction": "-1%"}, {"inertia": "5%"}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             vary(scene, bad)
+
+
+TOO_MUCH = {
+    "mass": ("100%", "could become negative or 0"),
+    "friction": ("101%", "could become negative"),
+    "length": (0.18, "could become negative or 0"),
+    "finger_inertia": (0.003, "could become negative or 0"),
+    "viscous": (0.03, "could become negative"),
+    "dry": ("200%", "could become negative"),
+    "joint": (0.08, "change sides"),
+    "vertices": (0.02, "edges of the polygon could cross"),
+}
+
+
+@pytest.mark.parametrize(("name", "amount", "cause"), [(name, *rest) for name, rest in TOO_MUCH.items()])
+def test_amounts_by_which_a_draw_may_be_no_scene(scene, name, amount, cause):
+    with pytest.raises(ValueError, match=f"^{name}={amount}: too much, .*{cause}"):
+        vary(scene, {name: amount})
+
+
+@pytest.mark.parametrize("amount", [0.004, 0.02, "15%", "60%"])
+def test_polygons_that_are_drawn_are_polygons(scene, amount):
+    """What is allowed stays simple at all corners of its range; what is refused, here, does not."""
+    count, rng = int(scene.object.count), np.random.default_rng(0)
+    value = np.asarray(scene.object.vertices)[:count]
+    size = float(str(amount).removesuffix("%")) / (100 if "%" in str(amount) else 1)
+    width = size * (np.abs(value) if "%" in str(amount) else 1.0)
+    drawn = value + width * rng.choice([-1.0, 1.0], (20_000, count, 2))
+    try:
+        vary(scene, {"vertices": amount})
+    except ValueError:
+        assert first_flaw(drawn) is not None
+    else:
+        assert first_flaw(drawn) is None
 
 
 def test_the_survey_counts_and_ranks(scene, checked):

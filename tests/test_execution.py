@@ -355,6 +355,7 @@ def test_a_contact_that_rolls_is_executed(wholearm, tmp_path):
     ("more", "cause"),
     [
         (("--friction", "much"), "--friction much: write a share"),
+        (("--perturb", "2", "--geometry", "0.02"), "--geometry 0.02: too much, edges of the polygon could cross"),
         (("--mass", "150%"), "--mass 150%: write a share"),
         (("--video",), "--video: needs a folder"),
     ],

@@ -42,7 +42,7 @@ def execute(
     try:
         from wholearm_jax.execution import Ending, Tolerance, require_wires
         from wholearm_jax.execution import execute as drive
-        from wholearm_jax.perturbation import Amounts
+        from wholearm_jax.perturbation import Amounts, require_objects
         from wholearm_jax.perturbation import perturb as drive_perturbed
     except ModuleNotFoundError as error:
         if error.name != "mujoco":
@@ -50,7 +50,12 @@ def execute(
         raise BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
     from wholearm_jax.result_file import read_torque
 
-    schedule = read_torque(torque)
+    schedule, amounts = read_torque(torque), Amounts(*shares, geometry, start)
+    if perturb:
+        try:
+            require_objects(loaded, amounts)
+        except ValueError as error:
+            raise BadInput(f"--{error}") from None
     folder = made_folder(out)
     prediction = predicted(loaded, schedule, torque, 1e-10, traced_or_refused(scene, loaded))
     within = Tolerance(position, angle)
@@ -65,7 +70,6 @@ def execute(
         print(f"{contact} {'made' if made else 'opened'}: {times} executed")
     many = None
     if perturb:
-        amounts = Amounts(*shares, geometry, start)
         many = drive_perturbed(prediction, perturb, amounts, seed=seed, timestep=timestep, tolerance=within)
         print(many.message)
     if folder is not None:

@@ -36,6 +36,19 @@ def first_flaw(outlines: Num[np.ndarray, "polygons vertices 2"]) -> tuple[int, s
     return row, "clockwise: give the vertices anticlockwise"
 
 
+def stays_simple(outline: Float[np.ndarray, "vertices 2"], moves: Float[np.ndarray, "vertices"]) -> bool:
+    """Whether a polygon surely remains one when each vertex moves anywhere, by at most its part of `moves`: then no
+    vertex can come to an edge that is not its own."""
+    after, reach = np.roll(outline, -1, axis=0), np.maximum(moves, np.roll(moves, -1))
+    along = after - outline
+    to = outline[:, None] - outline
+    share = np.clip((to * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
+    distance = np.linalg.norm(to - share[..., None] * along, axis=-1)
+    vertex, edge = np.indices(distance.shape)
+    own = (vertex == edge) | (vertex == (edge + 1) % len(outline))
+    return bool(np.all(own | (distance > moves[:, None] + reach)))
+
+
 def _crossing(outlines: Float[np.ndarray, "polygons vertices 2"]) -> Num[np.ndarray, "polygons 2"]:
     """The first two edges that touch without being neighbours, or fold back on each other; -1 where none do."""
     many, count = outlines.shape[:2]

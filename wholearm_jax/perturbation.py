@@ -25,6 +25,7 @@ from mujoco import rollout
 from wholearm_jax.contacts import gaps, normal_rows
 from wholearm_jax.execution import Ending, Tolerance, clock, judge, motor_torques, require_wires, start_of, target_of
 from wholearm_jax.free_bodies import Softness, free_bodies
+from wholearm_jax.outline import stays_simple
 from wholearm_jax.proportion import wilson
 from wholearm_jax.result import Result
 from wholearm_jax.scene import Formation, Scene, body
@@ -91,8 +92,12 @@ def perturb(
     tolerance: Tolerance = Tolerance(),
     threads: int | None = None,
 ) -> Robustness:
-    """Execute `count` perturbed copies of a plan on `threads` threads (default: every processor)."""
+    """Execute `count` perturbed copies of a plan on `threads` threads (default: every processor).
+
+    Raises ValueError as `require_wires` and `require_objects` do.
+    """
     require_wires(prediction)
+    require_objects(prediction.scene, amounts)
     rng = np.random.default_rng(seed)
     scenes = [_perturbed(prediction.scene, amounts, rng) for _ in range(count)]
     shifts = rng.uniform(-1, 1, (count, 3)) * amounts.start
@@ -109,6 +114,15 @@ def perturb(
             ending, _ = judge(s, end, target, tolerance)
             runs.append(_summary(prediction.scene, s, end, target, ending))
     return Robustness(amounts, seed, tolerance, tuple(runs))
+
+
+def require_objects(scene: Scene, amounts: Amounts) -> None:
+    """Raise ValueError for amounts by which what is drawn may be no object."""
+    if not 0 <= amounts.friction <= 1 or not 0 <= amounts.mass < 1:
+        raise ValueError("friction, mass: shares of up to 1, of the mass less than 1")
+    outline = np.asarray(scene.object.vertices)[: int(scene.object.count)]
+    if not stays_simple(outline, np.full(len(outline), np.sqrt(2) * amounts.geometry)):
+        raise ValueError(f"geometry {amounts.geometry:g}: too much, edges of the polygon could cross")
 
 
 def _perturbed(scene: Scene, amounts: Amounts, rng: np.random.Generator) -> Scene:

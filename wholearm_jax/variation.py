@@ -8,13 +8,15 @@ depends neither on the chunk that `i` is computed in nor on what else varies.
 import math
 import zlib
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
+from wholearm_jax.outline import stays_simple
 from wholearm_jax.plan import stacked
 from wholearm_jax.scene import COORDINATES, LINKS, Scene
 
@@ -22,24 +24,25 @@ FINGERS = ("finger 1", "finger 2")
 
 
 class Quantity(NamedTuple):
-    """Where floats of a scene that may vary are, and what their entries are called."""
+    """Where floats of a scene that may vary are, what their entries are called, and which values a scene allows."""
 
     where: Callable
     entries: tuple[str, ...] | None = None
+    allowed: Literal["any", "positive", "not negative"] = "any"
 
 
 QUANTITIES = {
     "vertices": Quantity(lambda s: s.object.vertices),
-    "mass": Quantity(lambda s: s.object.mass),
-    "friction": Quantity(lambda s: s.object.friction, LINKS),
-    "inertia": Quantity(lambda s: s.object.inertia),
+    "mass": Quantity(lambda s: s.object.mass, allowed="positive"),
+    "friction": Quantity(lambda s: s.object.friction, LINKS, "not negative"),
+    "inertia": Quantity(lambda s: s.object.inertia, allowed="positive"),
     "center_of_mass": Quantity(lambda s: s.object.center_of_mass, ("x", "y")),
     "joint": Quantity(lambda s: s.hand.joint, tuple(f"{f} {c}" for f in FINGERS for c in "xy")),
-    "length": Quantity(lambda s: s.hand.length, FINGERS),
+    "length": Quantity(lambda s: s.hand.length, FINGERS, "positive"),
     "offset": Quantity(lambda s: s.hand.offset, FINGERS),
-    "finger_inertia": Quantity(lambda s: s.hand.inertia, FINGERS),
-    "viscous": Quantity(lambda s: s.hand.viscous, FINGERS),
-    "dry": Quantity(lambda s: s.hand.dry, FINGERS),
+    "finger_inertia": Quantity(lambda s: s.hand.inertia, FINGERS, "positive"),
+    "viscous": Quantity(lambda s: s.hand.viscous, FINGERS, "not negative"),
+    "dry": Quantity(lambda s: s.hand.dry, FINGERS, "not negative"),
     "gravity": Quantity(lambda s: s.gravity, ("x", "y")),
     "start": Quantity(lambda s: s.start, COORDINATES),
 }
@@ -115,7 +118,8 @@ class Ensemble(eqx.Module):
 def vary(scene: Scene, amounts: dict[str, float | str], *, seed: int = 0) -> Ensemble:
     """Build an ensemble from amounts such as `{"vertices": 0.0005, "friction": "20%"}`.
 
-    Raises ValueError for a quantity that the scene does not have or an amount that is not one.
+    Raises ValueError for a quantity that the scene does not have, an amount that is not one, or one by which what is
+    drawn may be no scene: a mass that is not positive, a polygon that crosses itself.
     """
     return Ensemble(scene, tuple((name, _amount(scene, name, given)) for name, given in amounts.items()), seed)
 
@@ -168,4 +172,24 @@ def _amount(scene: Scene, name: str, given: float | str) -> Amount:
         size = math.nan
     if not 0 <= size < math.inf:
         raise ValueError(f"{name}={text}: write an amount such as 0.0005, in SI units, or 20%")
-    return Amount(size, text.endswith("%"))
+    amount = Amount(size, text.endswith("%"))
+    trouble = _trouble(scene, name, amount)
+    if trouble is not None:
+        raise ValueError(f"{name}={text}: too much, {trouble}")
+    return amount
+
+
+def _trouble(scene: Scene, name: str, amount: Amount) -> str | None:
+    """What may be wrong with scenes that are drawn with an amount."""
+    value, allowed = np.asarray(QUANTITIES[name].where(scene)), QUANTITIES[name].allowed
+    width = amount.size * (np.abs(value) if amount.relative else np.ones_like(value))
+    least = np.min(value - width)
+    if allowed != "any" and (least < 0 or (allowed == "positive" and least == 0)):
+        return "it could become negative" if allowed == "not negative" else "it could become negative or 0"
+    if name == "joint" and value[0, 0] - width[0, 0] <= value[1, 0] + width[1, 0]:
+        return "the fingers could change sides"
+    if name == "vertices":
+        count = int(scene.object.count)
+        if not stays_simple(value[:count], np.hypot(*width[:count].T)):
+            return "edges of the polygon could cross"
+    return None
