@@ -4,6 +4,7 @@ import inspect
 import sys
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -111,6 +112,29 @@ def test_amounts_that_are_not_are_refused(scene):
     for bad in ({"colour": 1}, {"friction": "ten"}, {"friction": "-1%"}, {"inertia": "5%"}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             vary(scene, bad)
+
+
+def test_shares_and_amounts(scene):
+    """A share is of each value, an amount in its unit; the object's inertia goes with its mass."""
+    scene = eqx.tree_at(lambda s: s.object.inertia, scene, jnp.asarray(1e-4), is_leaf=lambda leaf: leaf is None)
+    friction = jnp.array([0.1, 0.2, 0.4])
+    scene = eqx.tree_at(lambda s: s.object.friction, scene, friction)
+    drawn = vary(scene, {"mass": "20%", "friction": "50%", "viscous": 0.005, "gravity": 0.2}, seed=SEED)
+    many = jax.vmap(drawn.draw)(jnp.arange(2000))
+
+    def spread(values, middle):
+        """How far draws go to either side, at the most."""
+        off = np.asarray(values) - np.asarray(middle)
+        return np.stack([-off.min(0), off.max(0)])
+
+    np.testing.assert_allclose(spread(many.object.mass, scene.object.mass), 0.2 * float(scene.object.mass), rtol=0.01)
+    np.testing.assert_allclose(many.object.inertia / many.object.mass, 1e-4 / float(scene.object.mass), rtol=1e-12)
+    np.testing.assert_allclose(spread(many.object.friction, friction), np.stack([0.5 * friction] * 2), rtol=0.01)
+    np.testing.assert_allclose(spread(many.hand.viscous, scene.hand.viscous), 0.005, rtol=0.01)
+    np.testing.assert_allclose(spread(many.gravity, scene.gravity), 0.2, rtol=0.01)
+    columns = np.column_stack([many.object.mass, many.object.friction, many.hand.viscous, many.gravity])
+    apart = np.corrcoef(columns.T) - np.eye(columns.shape[1])
+    assert np.abs(apart).max() < 0.1, "all are drawn apart"
 
 
 TOO_MUCH = {

@@ -1,5 +1,6 @@
 """Executions on free bodies against the prediction, closed forms and balances that assume no formation."""
 
+import csv
 import json
 import sys
 from pathlib import Path
@@ -21,6 +22,7 @@ from wholearm_jax.execution import Ending, Tolerance, clock, drive, execute, jud
 from wholearm_jax.execution_drawing import animate, draw_execution, draw_execution_strip
 from wholearm_jax.free_bodies import _wedges, free_bodies
 from wholearm_jax.perturbation import Amounts, _perturbed, perturb, start_near, wilson
+from wholearm_jax.result_file import write_execution
 from wholearm_jax.scene import body, formation, parse_contact
 from wholearm_jax.system import system
 
@@ -349,6 +351,26 @@ def test_a_contact_that_rolls_is_executed(wholearm, tmp_path):
     column = header.split(",").index("cn palm:v0")
     assert np.median([float(row.split(",")[column]) for row in rows]) > 1.0
     assert (tmp_path / "execution.png").stat().st_size > 10_000
+
+
+def test_the_table_of_an_execution(executions, tmp_path):
+    """Every so many steps, each column what its header says; contacts by name."""
+    done = executions["hexagon"]
+    write_execution(done, tmp_path / "execution.csv", samples=100)
+    header, *rows = csv.reader((tmp_path / "execution.csv").read_text().splitlines())
+    table = {name: np.array(column, float) for name, column in zip(header, zip(*rows, strict=True), strict=True)}
+    at = np.searchsorted(done.course.time, table["t"])
+    np.testing.assert_array_equal(done.course.time[at], table["t"])
+    assert 200 <= len(at) <= 402
+    assert table["t"][0] == 0
+    assert table["t"][-1] > 1.98
+    for k, name in enumerate(("x", "y", "phi", "theta1", "theta2")):
+        np.testing.assert_array_equal(table[name], done.course.z[at, k])
+        np.testing.assert_array_equal(table[f"{name}_dot"], done.course.z_dot[at, k])
+    planned = {name for phase in done.prediction.phases for name in phase.contacts}
+    assert {name.removeprefix("cn ") for name in header if name.startswith("cn ")} == planned
+    for name in planned:
+        np.testing.assert_array_equal(table[f"cn {name}"], done.course.cn[at, done.names.index(name)])
 
 
 @pytest.mark.parametrize(

@@ -41,3 +41,36 @@ def test_impacts_are_told():
     onward = [way for way in found if way.entering.endswith("%")]
     assert onward
     assert all(way.speed > 0 and not way.pulls for way in onward)
+
+
+@pytest.mark.parametrize(
+    ("length", "on_finger"), [(0.1, {"v1", "v2"}), (0.05, {"v1", "e1"}), (0.06, {"v1", "v2", "e1", "e2"})]
+)
+def test_what_touches_lies_on_its_feature(length, on_finger):
+    """A square of 60 mm between upright fingers that are longer, shorter, and as long, their tips at corners."""
+    finger = {"length": length, "inertia": 2e-3, "torque_limit": 1.0}
+    scene = wa.parse(
+        {
+            "title": "square",
+            "gravity": 9.81,
+            "hand": {"finger1": finger | {"joint": [0.03, 0.0]}, "finger2": finger | {"joint": [-0.03, 0.0]}},
+            "object": {
+                "vertices": [[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]],
+                "mass": 0.2,
+                "friction": 0.3,
+            },
+            "start": {"x": 0.0, "y": 0.03, "phi": 0.0, "theta1": np.pi / 2, "theta2": np.pi / 2},
+            "phase": [
+                {
+                    "name": "hold",
+                    "contacts": ["palm:v0", "palm:v1", "finger1:v1", "finger2:v0"],
+                    "hold": True,
+                    "duration": 1.0,
+                }
+            ],
+        }
+    )
+    found = {name.removeprefix("finger1:") for name in touching(scene, scene.start) if name.startswith("finger1")}
+    assert found == on_finger
+    palm = {name for name in touching(scene, scene.start) if name.startswith("palm")}
+    assert palm == {"palm:v0", "palm:v1"}

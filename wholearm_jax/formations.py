@@ -90,10 +90,8 @@ def ways(scene: Scene, z: Float[Array, "5"], z_dot: Float[Array, "5"] | None = N
 
     `z_dot` (SI) is the speed with which the object arrives there, if it does.
     """
-    everything = touching(scene, z)
-    names = [name for name in everything if not _flush(scene, name, everything)]
     found = []
-    for four in itertools.combinations(names, 4):
+    for four in itertools.combinations(touching(scene, z), 4):
         chosen = formation(four)
         tangent = _tangent(scene, z, chosen)
         if tangent is None:
@@ -104,15 +102,6 @@ def ways(scene: Scene, z: Float[Array, "5"], z_dot: Float[Array, "5"] | None = N
             if way is not None:
                 found.append(way)
     return tuple(sorted(found, key=lambda way: -way.static))
-
-
-def _flush(scene, name, names) -> bool:
-    """Whether a tip's contact repeats what an edge's two vertices on the same finger say."""
-    link, _, feature = name.partition(":")
-    if not feature.startswith("e"):
-        return False
-    number, count = int(feature[1:]), int(scene.object.count)
-    return f"{link}:v{number}" in names and f"{link}:v{(number + 1) % count}" in names
 
 
 def _tangent(scene, z, chosen):
