@@ -1,0 +1,66 @@
+"""The bound by its definition: linear programmes at places of the wire and speeds, solved by another's solver."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+import wholearm_jax as wa
+from wholearm_jax import squeeze
+from wholearm_jax.squeeze import FASTEST, PLACES, SPEEDS
+
+coefficients, bound = jax.jit(squeeze.coefficients), jax.jit(squeeze.bound)
+
+
+def largest_least_force(offset, slope, limits, forward=None):
+    """The largest `m` with `offset + slope tau >= m` within limits, and `row tau + constant >= 0` if so wanted."""
+    above, most = np.column_stack([-slope, np.ones(len(slope))]), offset
+    if forward is not None:
+        row, constant = forward
+        above, most = np.vstack([above, [*-row, 0.0]]), np.append(most, constant)
+    box = [*((-limit, limit) for limit in limits), (None, None)]
+    answer = linprog([0.0, 0.0, -1.0], A_ub=above, b_ub=most, bounds=box)
+    return -answer.fun if answer.status == 0 else -np.inf
+
+
+def best_at(table, duration, place, rests):
+    """The largest least force at a share of the wire, and the most that each interval of speeds could give."""
+    s = table.breaks[0] + place * table.length
+    motion, force = (np.asarray(a) for a in coefficients(table, s))
+    limits = np.asarray(table.torque_limit)
+    sign = {0.0: 1, 1.0: -1}.get(place) if rests else None
+    if sign is not None:
+        still = largest_least_force(force[:, 0], force[:, 3:], limits, (sign * motion[3:], sign * motion[0]))
+        return still, still
+    speeds = FASTEST * float(table.length) / duration * np.linspace(0.0, 1.0, SPEEDS + 1) ** 2
+
+    def at(square, linear):
+        return largest_least_force(force[:, 0] + square + linear, force[:, 3:], limits)
+
+    true = max(at(force[:, 1] * v**2, force[:, 2] * v) for v in speeds)
+    pairs = [
+        (np.outer(force[:, 1], [u**2, v**2]), np.outer(force[:, 2], [u, v])) for u, v in itertools.pairwise(speeds)
+    ]
+    return true, max(at(square.max(1), linear.max(1)) for square, linear in pairs)
+
+
+@pytest.mark.parametrize("limits", [(1.0, 1.0), (0.4, 1.5)])
+@pytest.mark.parametrize("rests", [True, False], ids=["from rest to rest", "at speed throughout"])
+@pytest.mark.parametrize("duration", [1.0, 0.1])
+@pytest.mark.parametrize("phase", [0, 1])
+def test_the_bound_is_the_least_of_the_best_forces(phase, duration, rests, limits):
+    """Exactly that of intervals of speeds, and above what any of their speeds allows."""
+    scene = eqx.tree_at(lambda s: s.hand.torque_limit, wa.load("heptagon"), jnp.asarray(limits))
+    table = wa.trace(scene)[phase].table
+    top = bound(table, jnp.asarray(duration), jnp.asarray(rests), jnp.asarray(rests))
+    value, tight = float(top.value), float(top.share)
+    true, most = best_at(table, duration, tight, rests)
+    assert value == pytest.approx(most, rel=1e-9)
+    assert value >= true - 1e-9
+    assert float(top.s) == pytest.approx(float(table.breaks[0] + tight * table.length), rel=1e-12)
+    for place in (0.0, *(np.random.default_rng(0).choice(np.arange(1, PLACES), 6) / PLACES), 1.0):
+        assert best_at(table, duration, float(place), rests)[1] >= value - 1e-9
