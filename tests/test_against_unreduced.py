@@ -1,5 +1,8 @@
 """The wire's motion against an independent simulation of all five coordinates (`unreduced.py`, NumPy and SciPy)."""
 
+import functools
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,7 +11,7 @@ from scipy.optimize import brentq
 
 import wholearm_jax
 from wholearm_jax import scene_file, squeeze
-from wholearm_jax.phase import run, start_configuration
+from wholearm_jax.phase import configuration, run, start_configuration
 from wholearm_jax.sampling import sample
 from wholearm_jax.stepping import Integration
 
@@ -22,6 +25,14 @@ def passing(table, knots=9):
     places = table.breaks[0] + length * jnp.minimum(u, 1.0) ** 2
     held = squeeze.holds(table, places, 2 * length * u * rate, jnp.full(knots, 2 * length * rate**2))
     return wholearm_jax.torque(np.linspace(0.0, DURATION, knots), held.torque)
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, 0))
+def configurations(table, s):
+    """`z` (SI) at places of a wire."""
+    piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
+    return configuration(table, piece, s)
 
 
 def other_hand():
@@ -194,3 +205,59 @@ def test_start_after_waiting(name, phase):
     error = np.abs(ours.z - z).max()
     print(f"{name}, phase {phase}: departs at {departure:.3f} s, largest error {error:.1e}")
     assert error < 1e-9
+
+
+@pytest.mark.parametrize("phase", [0, 1])
+@pytest.mark.parametrize("name", ["heptagon", "hexagon"])
+def test_which_way_an_object_at_rest_sets_out(name, phase):
+    """With friction 0.5 the other simulation's accelerations, each with its own friction, allow either way, or both."""
+    data = scene_file.to_dict(wholearm_jax.load(name))
+    data["object"]["friction"] = 0.5
+    table = wholearm_jax.trace(wholearm_jax.parse(data))[phase].table
+    model = unreduced.Model(data, data["phase"][phase]["contacts"])
+    begin = np.asarray(start_configuration(table))
+    way = model.direction(begin, data["phase"][phase]["toward"])
+    signs, still = np.sign(model.reversing(begin, way)), np.zeros(5)
+    rng, met = np.random.default_rng(1), set()
+    for _ in range(40):
+        torque = rng.uniform(-1.0, 1.0, 2)
+        ahead, behind = (model.solve(begin, still, torque, side * signs)[0] @ way for side in (1, -1))
+        motion = run(table, wholearm_jax.torque([0.0, 1.0], [torque] * 2), 0.0, 1.0, Integration(), "moving").motion
+        waits, status = bool(motion.held[0]), wholearm_jax.Status(int(motion.status))
+        moves = int(motion.count) > 0 and not waits
+        expected = (ahead > 0, behind < 0)
+        met.add(expected)
+        assert (status is wholearm_jax.Status.AMBIGUOUS) == (expected == (True, True))
+        assert (status is wholearm_jax.Status.REVERSED and not moves) == (expected == (False, True))
+        assert moves == (expected == (True, False))
+        assert waits == (expected == (False, False))
+    assert len(met) == 4
+
+
+@pytest.mark.parametrize("phase", [0, 1])
+@pytest.mark.parametrize("name", ["heptagon", "hexagon"])
+def test_wedged(name, phase):
+    """Friction that turns the sign of the other simulation's determinant on the wire is told, and no other."""
+    data = scene_file.to_dict(wholearm_jax.load(name))
+    free = wholearm_jax.trace(wholearm_jax.load(name))[phase].table
+    ends = np.asarray(free.breaks)[[0, -1]]
+    places = ends[0] + np.ptp(ends) * np.linspace(0.0, 1.0, 101)
+    found = []
+    for friction in (0.5, 0.65, 0.8, 1.0, 1.2, 1.4):
+        data["object"]["friction"] = friction
+        model = unreduced.Model(data, data["phase"][phase]["contacts"])
+        smooth = unreduced.Model(
+            data | {"object": data["object"] | {"friction": 0.0}}, data["phase"][phase]["contacts"]
+        )
+        way, turned = None, []
+        for z in np.asarray(configurations(free, jnp.asarray(places))):
+            along = model.direction(z, data["phase"][phase]["toward"])
+            way = along if way is None or along @ way > 0 else -along
+            signs = np.sign(model.reversing(z, way))
+            pair = (np.linalg.det(one.matrix(z, np.zeros(5), signs)[0]) for one in (model, smooth))
+            turned.append(next(pair) * next(pair))
+        status = wholearm_jax.Status(int(wholearm_jax.trace(wholearm_jax.parse(data))[phase].table.status))
+        assert (status is wholearm_jax.Status.SINGULAR) == (min(turned) < 0)
+        found.append(min(turned) < 0)
+    assert True in found
+    assert False in found

@@ -142,15 +142,19 @@ class Model:
         """Slip velocities (0 for contacts that roll) and joint speeds: what must not change sign within a segment."""
         return np.concatenate([np.where(self.rolls, 0.0, self.geometry(z, z_dot)[2] @ z_dot), z_dot[3:]])
 
-    def solve(self, z, z_dot, torque, signs):
-        """Accelerations (5) and constraint forces (every `c_n`, then `c_t` of those that roll) for given signs of slips
-        and joint speeds (2)."""
+    def matrix(self, z, z_dot, signs):
+        """The matrix of the equations of motion and of the constraints, and `G_dot z_dot` of the latter."""
         _, gap_rows, slip_rows, left = self.geometry(z, z_dot)
         wrench = gap_rows - (self.friction * np.where(self.rolls, 0.0, signs[:-2]))[:, None] * slip_rows
         held_rows, held_left = self.rolling(z, z_dot)
         wrench, gap_rows = np.concatenate([wrench, held_rows]).T, np.concatenate([gap_rows, held_rows])
         left = np.concatenate([left, held_left])
-        matrix = np.block([[self.mass_matrix, -wrench], [gap_rows, np.zeros((len(left), len(left)))]])
+        return np.block([[self.mass_matrix, -wrench], [gap_rows, np.zeros((len(left), len(left)))]]), left
+
+    def solve(self, z, z_dot, torque, signs):
+        """Accelerations (5) and constraint forces (every `c_n`, then `c_t` of those that roll) for given signs of slips
+        and joint speeds (2)."""
+        matrix, left = self.matrix(z, z_dot, signs)
         force = np.concatenate([self.mass * self.gravity, [0.0], torque])
         force[3:] -= self.viscous * z_dot[3:] + self.dry * signs[-2:]
         answer = np.linalg.solve(matrix, np.concatenate([force, -left]))

@@ -16,7 +16,9 @@ from typing import Annotated, Any
 import typer
 
 from wholearm_jax.arguments import BadInput, SceneName, TorqueFile, note_limits, writing
+from wholearm_jax.settings import configure
 
+MANY = 30_000  # scenes from which on compiling well, which takes twice as long, pays (`benchmarks/batch.py`)
 ARRIVAL = 0.01  # share of the wire: perturbed plans cannot end where an unperturbed one must
 Vary = Annotated[list[str] | None, typer.Option("--vary", help="QUANTITY=AMOUNT, e.g. vertices=0.0005, friction=20%.")]
 
@@ -43,6 +45,7 @@ def check(
     """Check a schedule against many variants of a scene; the same command goes on with a store it left unfinished."""
     if (polygons is None) == (count is None) or (polygons is None) != bool(vary):
         raise BadInput("check: give either --count, with --vary QUANTITY=AMOUNT, or --polygons FILE.npz")
+    configure(compiled="quickly" if count is not None and count < MANY else "well")
     _use_all_processors()
     place = _join(coordinator, processes, process)
     try:

@@ -50,7 +50,8 @@ def main() -> None:
     # Solving small systems on several threads costs more than it gains: they wait for one another, spinning.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("MPLBACKEND", "agg")
-    configure(compiled="well" if sys.argv[1:2] == ["check"] else "quickly")
+    if sys.argv[1:2] != ["check"]:  # which knows itself how many scenes there are to compile for
+        configure()
     _keep_compiled()
     from wholearm_jax.scene_file import SceneError
 
