@@ -333,7 +333,10 @@ def test_command(wholearm, tmp_path):
     assert out.splitlines()[-1].startswith("executed: ok, ")
     content = json.loads((tmp_path / "execution.json").read_text())
     assert content["status"] == "ok"
-    assert content["perturbed"]["executions"] == 2
+    perturbed = content["perturbed"]
+    assert perturbed["executions"] == len(perturbed["runs"]) == 2
+    assert perturbed["successes"] == sum(run["status"] == "ok" for run in perturbed["runs"])
+    assert perturbed["interval_95"] == list(wilson(perturbed["successes"], 2))
     assert {"execution.csv", "execution.png", "execution.svg", "model.xml"} <= {p.name for p in tmp_path.iterdir()}
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
     assert (model.nq, model.nu, model.opt.timestep) == (5, 2, pytest.approx(5e-4))

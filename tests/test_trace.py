@@ -166,3 +166,30 @@ def test_a_wire_passes_the_turning_point_of_theta1():
     panel, xi = powers(table, jnp.asarray(1), table.breaks[1])
     assert abs(float(on_panel(table.velocity, panel, xi)[3])) < 1e-10
     assert float(table.breaks[1]) < float(table.length) - 1e-3
+
+
+@pytest.mark.parametrize(("toward", "contact", "x"), [("x-", "palm:v0", -0.02), ("x+", "palm:v1", 0.03)])
+def test_a_vertex_leaves_the_palm_where_it_ends(toward, contact, x):
+    """A block that is wider above slides between fingers whose joints lie below the palm's ends, 50 and 60 mm away."""
+    finger = {"length": 0.12, "inertia": 2e-3, "torque_limit": 1.0}
+    contacts = ["palm:v0", "palm:v1", "finger1:v2", "finger2:v3"]
+    scene = wa.parse(
+        {
+            "title": "wider above",
+            "gravity": 9.81,
+            "hand": {"finger1": finger | {"joint": [0.06, -0.02]}, "finger2": finger | {"joint": [-0.05, -0.02]}},
+            "object": {
+                "vertices": [[-0.03, -0.03], [0.03, -0.03], [0.05, 0.03], [-0.05, 0.03]],
+                "mass": 0.2,
+                "friction": 0.1,
+                "center_of_mass": [0.0, 0.0],
+            },
+            "start": {"x": 0.0, "y": 0.03, "phi": 0.0, "theta1": 1.7, "theta2": np.pi / 2},
+            "phase": [{"name": "slide", "contacts": contacts, "toward": toward, "duration": 1.0}],
+        }
+    )
+    (traced,) = wa.trace(scene)
+    assert int(traced.table.status) == wa.Status.OK
+    assert ending(traced, scene.phases[0], 8) == f"{contact} leaves its feature"
+    z = np.asarray(end_configuration(traced))
+    np.testing.assert_allclose(z[:3], [x, 0.03, 0.0], atol=1e-12)
