@@ -17,6 +17,7 @@ ORDER = (
         "status",
         "settings",
         "precision",
+        "requirements",
         "lookup",
         "outline",
         "scene",

@@ -19,7 +19,7 @@ import numpy as np
 
 from wholearm_jax.phase import Traced, run
 from wholearm_jax.plan import require_motion, simulate, trace
-from wholearm_jax.precision import require_x64
+from wholearm_jax.requirements import require_x64
 from wholearm_jax.result import Result
 from wholearm_jax.scene import Phase, Scene, replace_duration
 from wholearm_jax.schedule import Torque, padded

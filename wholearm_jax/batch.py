@@ -34,8 +34,8 @@ from wholearm_jax.plan import (
     trace_next,
     trace_told,
 )
-from wholearm_jax.precision import require_x64
 from wholearm_jax.programs import Program
+from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result
 from wholearm_jax.scene import Formation, Scene, body
 from wholearm_jax.schedule import Torque, padded
@@ -156,13 +156,16 @@ def check(
     it ends within a share `arrival` of its wire's length of the end (1e-6 for a plan that does not vary, by
     `simulate`), at a speed that fits (`verdict.BRAKING`). Memory is that of `chunk` scenes beside the result. Returns
     `Checked`: status, margin, time, contact, phase and end pose of each scene. Never raises for a scene that fails:
-    that is a status. Raises ValueError for a schedule shorter than a plan.
+    that is a status. Raises ValueError for a schedule shorter than a plan, for numbers that are not positive, and for a
+    `count` of more scenes than are given.
     """
     source = scenes if isinstance(scenes, Ensemble) else Given(scenes if isinstance(scenes, Scene) else stack(scenes))
     if count is None:
         if isinstance(source, Ensemble):
             raise ValueError("an ensemble has no end: say how many of its scenes to check, with count")
         count = source.count
+    elif isinstance(source, Given) and count > source.count:
+        raise ValueError(f"count is {count}, but {source.count} scenes are given")
     parts = check_chunks(source, torque, count, tolerance=tolerance, arrival=arrival, chunk=chunk, devices=devices)
     return Checked(*(np.concatenate(column) for column in zip(*(part for _, part in parts), strict=True)))
 
@@ -180,6 +183,7 @@ def check_chunks(
 ) -> Iterator[tuple[int, Checked]]:
     """`check` one chunk after the other: numbers of chunks (those `wanted`, by default all) with their results."""
     require_x64()
+    require_positive(count=count, tolerance=tolerance, arrival=arrival, chunk=chunk)
     require_motion(source.nominal)  # holds need linear programmes, which compiled checks leave out
     require_covered(source.nominal, torque)
     mesh = Mesh(np.asarray(devices or jax.local_devices()), ("scenes",))

@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float
 from wholearm_jax.contacts import contacts, frames
 from wholearm_jax.free_bodies import FreeBodies, Softness, free_bodies
 from wholearm_jax.phase import destination
+from wholearm_jax.requirements import require_positive
 from wholearm_jax.result import Result
 from wholearm_jax.sampling import trajectory
 from wholearm_jax.scene import Body, Formation, Hand, Scene, body, formation, pair_name
@@ -127,8 +128,10 @@ def execute(
 ) -> Execution:
     """Drive the free bodies by a predicted plan's torque schedule, from its start to its end.
 
-    The prediction may fail, but its wires must be known: raises ValueError where one could not be traced.
+    The prediction may fail, but its wires must be known: raises ValueError where one could not be traced, and for a
+    `timestep` that is not positive.
     """
+    require_positive(timestep=timestep)
     scene = prediction.scene
     require_wires(prediction)
     times, step = clock(scene, timestep)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.phase import Traced
 from wholearm_jax.plan import least, outcomes, roomy, steps_within, trace
-from wholearm_jax.precision import require_x64
+from wholearm_jax.requirements import require_x64
 from wholearm_jax.scene import Scene
 from wholearm_jax.schedule import Torque
 from wholearm_jax.stepping import Integration, tolerance_as_data

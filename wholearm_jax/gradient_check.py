@@ -17,7 +17,7 @@ import numpy as np
 import optax
 
 from wholearm_jax.plan import margin
-from wholearm_jax.precision import require_x64
+from wholearm_jax.requirements import require_x64
 from wholearm_jax.scene import Scene
 from wholearm_jax.schedule import Torque
 from wholearm_jax.stepping import Integration

@@ -25,9 +25,10 @@ from wholearm_jax.linearisation import Limits
 from wholearm_jax.pacing import HOW, Step
 from wholearm_jax.phase import Traced, balance_at_start, run
 from wholearm_jax.plan import outcomes, trace
-from wholearm_jax.precision import array, require_x64
+from wholearm_jax.precision import array
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import blank
+from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result, describe
 from wholearm_jax.scene import Scene, replace_duration
 from wholearm_jax.schedule import Torque, evenly, in_turn, padded, rounded
@@ -69,11 +70,12 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
     allows a larger margin. As the inverse dynamics at the knots only, the schedule carries the object near the wire's
     end, not exactly to it. A phase that holds the object gets its best torque.
 
-    Derivation, section 8. Returns `knots` rows a phase.
+    Derivation, section 8. Returns `knots` rows a phase. Raises ValueError for fewer than two.
 
     >>> wa.quasistatic(wa.load("heptagon"), knots=11).values.shape
     (22, 2)
     """
+    require_knots(knots)
     traced = traced or trace(scene)
 
     def torques(at, phase):
@@ -138,16 +140,16 @@ def optimise(
     and gets the best torque of its statics, approached and left as fast as `rate_limit` allows. Where no torque can
     hold a formation, nothing is searched and the status says so.
 
-    Derivation, section 9. Raises RuntimeError without float64, ValueError for a `rate_limit` that is not positive,
-    or `durations` that are not.
+    Derivation, section 9. Raises RuntimeError without float64, ValueError for fewer than two `knots`, and for numbers
+    that are not positive.
 
     >>> found = wa.optimise(wa.load("heptagon"))
     >>> found.result.status.label, [f"{share:.2f}" for share in found.reached]
     ('ok', ['1.00', '1.00'])
     """
     require_x64()
-    if rate_limit is not None and not rate_limit > 0:
-        raise ValueError("rate_limit must be positive")
+    require_knots(knots)
+    require_positive(steps=steps, tolerance=tolerance, rate_limit=np.inf if rate_limit is None else rate_limit)
     if durations is not None and not 0 < durations[0] <= durations[1]:
         raise ValueError("durations are (shortest, longest), positive and in this order")
     if durations is not None and durations[0] == durations[1]:
@@ -164,6 +166,12 @@ def optimise(
         if found[-1].result.status is Status.OK:
             return found[-1]
     return max(found, key=lambda one: one.result.margin)
+
+
+def require_knots(knots: int) -> None:
+    """Raise ValueError for too few to be a schedule."""
+    if knots < 2:
+        raise ValueError(f"knots must be at least 2, not {knots}")
 
 
 def _attempt(scene: Scene, traced, tops, wanted: Wanted, lead: float) -> Optimised:

@@ -27,6 +27,7 @@ from wholearm_jax.execution import Ending, Tolerance, clock, judge, motor_torque
 from wholearm_jax.free_bodies import Softness, free_bodies
 from wholearm_jax.outline import stays_simple
 from wholearm_jax.proportion import wilson
+from wholearm_jax.requirements import require_positive
 from wholearm_jax.result import Result
 from wholearm_jax.scene import Formation, Scene, body
 from wholearm_jax.system import system
@@ -94,8 +95,9 @@ def perturb(
 ) -> Robustness:
     """Execute `count` perturbed copies of a plan on `threads` threads (default: every processor).
 
-    Raises ValueError as `require_wires` and `require_objects` do.
+    Raises ValueError as `require_wires` and `require_objects` do, and for numbers that are not positive.
     """
+    require_positive(count=count, timestep=timestep)
     require_wires(prediction)
     require_objects(prediction.scene, amounts)
     rng = np.random.default_rng(seed)

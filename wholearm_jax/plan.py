@@ -24,8 +24,9 @@ from wholearm_jax.phase import (
     run,
     start_configuration,
 )
-from wholearm_jax.precision import array, digits, require_x64
+from wholearm_jax.precision import array, digits
 from wholearm_jax.programs import transformed
+from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result, describe
 from wholearm_jax.scene import Body, Phase, Scene, body
 from wholearm_jax.schedule import Torque, has_steps, padded
@@ -253,8 +254,8 @@ def simulate(
     """Simulate a plan under a torque schedule and judge it.
 
     `tolerance` is the integrator's; `traced` reuses the result of `trace`; `arrival` is how near its wire's end a phase
-    must come, as a share of the wire's length. Raises ValueError for a schedule that is shorter than the plan;
-    everything else is a status.
+    must come, as a share of the wire's length. Raises ValueError for a schedule that is shorter than the plan, and for
+    a `tolerance`, `max_steps` or `arrival` that is not positive; everything else is a status.
 
     Integrates the paper's eq. (16) (derivation, section 6). Raises RuntimeError without float64.
 
@@ -262,10 +263,11 @@ def simulate(
     >>> result = wa.simulate(scene, wa.torque([0.0, 2.0], [[0.0, 0.0], [0.0, 0.0]]))
     >>> result.status.label, result.phases[0].status.label
     ('stuck', 'stuck')
-    >>> print(result.message)
-    slide left: stuck, t = 1 s: friction holds the object at rest; raise the torque that pushes it, or lower the squeeze
+    >>> print(result.message.rpartition(":")[0])
+    slide left: stuck, t = 1 s, at rest since 0 s
     """
     require_x64()
+    require_positive(tolerance=tolerance, max_steps=max_steps, arrival=arrival)
     require_covered(scene, torque)
     traced = traced or trace(scene)
     stepped = steps_within(scene, torque)

@@ -1,4 +1,4 @@
-"""Precision: what counts as zero, what needs 64 bits, and numbers as arrays of the precision that JAX has."""
+"""Precision: what counts as zero, and numbers as arrays of the precision that JAX has."""
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +14,3 @@ def array(values, dtype=None) -> jax.Array:
     """`jnp.asarray`, but for what is not yet an array without a program to compile for each shape (20 ms each)."""
     known = isinstance(values, jax.Array)
     return jnp.asarray(values, dtype) if known else jax.device_put(np.asarray(values, dtype))
-
-
-def require_x64() -> None:
-    """Raise unless JAX computes in 64 bits: the statuses' tolerances need them."""
-    if jnp.zeros(()).dtype != jnp.float64:
-        raise RuntimeError("this function needs float64; call wholearm_jax.configure() before JAX computes anything")

@@ -11,6 +11,7 @@ from wholearm_jax.forces import arcs, force, on_arc
 from wholearm_jax.motion import Motion
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Table, on_panel, powers
+from wholearm_jax.requirements import require_positive
 from wholearm_jax.result import Result
 from wholearm_jax.schedule import Torque, padded, rounded, window
 from wholearm_jax.status import Status
@@ -69,13 +70,14 @@ def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
     """Every phase at `samples` evenly spaced times; a phase that failed stops there, and later ones are left out.
 
     A tuple of `Trajectory`, one a phase: `time` `(samples,)` [s], `z` and `z_dot` `(samples, 5)`, `cn` and `ct`
-    `(samples, 4)` [N].
+    `(samples, 4)` [N]. Raises ValueError for fewer than one.
 
     >>> scene = wa.load("heptagon")
     >>> first, *_ = wa.trajectory(wa.simulate(scene, wa.quasistatic(scene)), samples=5)
     >>> [f"{t:.2f}" for t in first.time.tolist()], first.cn.shape
     (['0.00', '0.25', '0.50', '0.75', '1.00'], (5, 4))
     """
+    require_positive(samples=samples)
     found, schedule, rows = [], padded(result.torque), rounded(samples, SAMPLED)
     for phase in result.phases:
         if int(phase.traced.table.status) != Status.OK:

@@ -127,9 +127,11 @@ def vary(scene: Scene, amounts: dict[str, float | str], *, seed: int = 0) -> Ens
 def stack(scenes: Sequence[Scene]) -> Scene:
     """Scenes along a leading axis of every array; polygons are padded to the largest.
 
-    Names and titles are the first scene's. Raises ValueError for scenes that differ in their number of phases, in how
-    a phase arrives, or in whether inertia and centre of mass are given.
+    Names and titles are the first scene's. Raises ValueError for no scenes, and for scenes that differ in their number
+    of phases, in how a phase arrives, or in whether inertia and centre of mass are given.
     """
+    if not scenes:
+        raise ValueError("there are no scenes to stack")
     capacity = max(s.object.vertices.shape[0] for s in scenes)
     alike = [_renamed(_padded(s, capacity), scenes[0]) for s in scenes]
     if len({jax.tree.structure(s) for s in alike}) > 1:
