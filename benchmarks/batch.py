@@ -6,11 +6,11 @@ The heptagon's whole plan (two phases, 2 s), every wire traced anew, vertices wi
 one process with a device for each processor: checks over the size of the batch, on one device as well, beside what two
 gain for arithmetic alone; checks of objects that differ in friction and mass alone; checks with the gradient of the
 margin with respect to all torques, optimisations, one process against two, the largest difference of a margin from the
-full resolution, compile times (the first call's, nothing kept) and peak memory. Beside them MuJoCo's rollouts of the
-same plan with the same scenes on all threads, at the longest of some time steps whose object ends within 1 % of its way
-from the prediction (`pose`), and at the longest whose least force is within 1 % of the predicted one, or else the
-shortest (`margin`; phases are of equal length, and twentieths of a phase at its ends are left out, where soft contacts
-take over).
+full resolution, compile times (the first call's, nothing kept; compiled quickly and well) and peak memory. Beside them
+MuJoCo's rollouts of the same plan with the same scenes on all threads, at the longest of some time steps whose object
+ends within 1 % of its way from the prediction (`pose`), and at the longest whose least force is within 1 % of the
+predicted one, or else the shortest (`margin`; phases are of equal length, and twentieths of a phase at its ends are
+left out, where soft contacts take over).
 """
 
 import argparse
@@ -38,6 +38,7 @@ from wholearm_jax.variation import vary
 HERE = Path(__file__).parent
 COUNTS = (128, 1024, 8192, 65_536, 1_000_000)
 ALIKE = 65_536
+COMPARED = 8192
 OPTIMISED = 3
 VARIED = {"vertices": 0.0002, "friction": "10%"}
 STEPS = (1.6e-3, 8e-4, 4e-4, 2e-4, 1e-4, 5e-5, 2.5e-5, 1.25e-5)
@@ -217,6 +218,34 @@ def by_processes(torque: Path) -> dict:
         return {str(n): processes(n, Path(folder), torque, 4096, 512) for n in (1, 2)}
 
 
+def compiling() -> dict:
+    """First calls and rates in processes of their own, compiled quickly and well, and from how many scenes on the
+    second pays."""
+    found = {}
+    for mode in ("quickly", "well"):
+        told = subprocess.run(
+            [sys.executable, __file__, "--compiled", mode], capture_output=True, text=True, check=True
+        )
+        found[mode] = json.loads(told.stdout)
+        print(
+            f"compiled {mode}: first call {found[mode]['first']:.1f} s, {found[mode]['rate']:.0f} a second", flush=True
+        )
+    quickly, well = found["quickly"], found["well"]
+    found["even"] = (well["first"] - quickly["first"]) / (1 / quickly["rate"] - 1 / well["rate"])
+    print(f"compiling well pays from {found['even']:.0f} scenes on", flush=True)
+    return found
+
+
+def first_and_rate(ensemble, torque) -> dict:
+    """The first call's time, nothing kept, and the rate of one of `COMPARED` scenes."""
+    times = []
+    for count in (BLOCK, COMPARED):
+        begun = time.perf_counter()
+        wa.check(ensemble, torque, count=count, arrival=ARRIVAL)
+        times.append(time.perf_counter() - begun)
+    return {"first": times[0], "rate": COMPARED / times[1]}
+
+
 def draw(found: dict, path: Path) -> None:
     """Rates over the size of the batch, with lines for what has one rate."""
     figure, ax = plt.subplots(figsize=(4.2, 3.4), layout="constrained")
@@ -238,20 +267,25 @@ def draw(found: dict, path: Path) -> None:
 
 def main() -> None:
     """Measure, save, draw, print."""
-    wa.configure(compiled="well")
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small batches of checks alone; nothing is written")
     parser.add_argument("--only", help="measure this part anew, e.g. check")
+    parser.add_argument("--compiled", choices=("quickly", "well"), help=argparse.SUPPRESS)
     given = parser.parse_args()
+    wa.configure(compiled=given.compiled or "well")
     jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are to be fresh
     ensemble, file = vary(wa.load("heptagon"), VARIED, seed=1), HERE / "data" / "heptagon_knots.csv"
     torque = wa.read_torque(file)
+    if given.compiled:
+        print(json.dumps(first_and_rate(ensemble, torque)))
+        return
     if given.quick:
         checks(ensemble, torque, COUNTS[:2])
         return
     parts = {
         "check": lambda: checks(ensemble, torque, COUNTS),
+        "compiled": compiling,
         "scaling": lambda: scaling(ensemble, torque),
         "same_geometry": lambda: same_geometry(torque),
         "mujoco": lambda: rollouts(ensemble, torque),
