@@ -49,18 +49,18 @@ def checked(drawn, schedule):
     return wa.check(drawn, schedule, arrival=ARRIVAL, tolerance=1e-10)
 
 
-def assert_as_alone(checked, scene, schedule, number, near):
+def assert_as_alone(checked, scene, schedule, number):
     """A scene's result is what `simulate` says of it."""
     alone = from_result(wa.simulate(scene, schedule, arrival=ARRIVAL))
     for name, value in alone._asdict().items():
-        # The place of a least force, unlike the force, is known to the square root of its error.
-        within = np.sqrt(near) / 30 if name == "time" else near
-        np.testing.assert_allclose(getattr(checked, name)[number], value, atol=within, rtol=within, err_msg=name)
+        # The place of a least force, unlike the force, is known to the square root of rounding.
+        near = 1e-6 if name == "time" else 1e-9
+        np.testing.assert_allclose(getattr(checked, name)[number], value, atol=near, rtol=near, err_msg=name)
 
 
 def test_each_scene_is_what_simulate_says_of_it_alone(drawn, schedule, checked):
     for number in range(3):
-        assert_as_alone(checked, drawn[number], schedule, number, 1e-9)
+        assert_as_alone(checked, drawn[number], schedule, number)
 
 
 def test_margins_are_right_to_what_is_said_by_default(ensemble, schedule, checked):
@@ -77,10 +77,10 @@ def test_margins_are_right_to_what_is_said_by_default(ensemble, schedule, checke
 def test_scenes_with_the_same_wires_side_by_side_are_what_they_are_alone(scene, schedule):
     loose = vary(scene, {"friction": "10%", "mass": "5%"}, seed=SEED)
     assert loose.same_wires
-    checked = wa.check(loose, schedule, count=2, arrival=ARRIVAL)
+    checked = wa.check(loose, schedule, count=2, arrival=ARRIVAL, tolerance=1e-10)
     assert checked.margin[0] != checked.margin[1]
     for number in range(2):
-        assert_as_alone(checked, loose.draw(number), schedule, number, 1e-6)
+        assert_as_alone(checked, loose.draw(number), schedule, number)
 
 
 def test_a_scene_that_cannot_be_followed_disturbs_no_other(drawn, schedule, checked):

@@ -18,7 +18,7 @@ import typer
 from wholearm_jax.arguments import BadInput, SceneName, TorqueFile, note_limits, writing
 from wholearm_jax.settings import configure
 
-MANY = 100_000  # scenes from which on compiling well, which takes twice as long, pays (`benchmarks/batch.py`)
+MANY = 100_000  # scenes from which on compiling well, which takes 1.6 times as long, pays (`benchmarks/batch.py`)
 ARRIVAL = 0.01  # share of the wire: perturbed plans cannot end where an unperturbed one must
 Vary = Annotated[list[str] | None, typer.Option("--vary", help="QUANTITY=AMOUNT, e.g. vertices=0.0005, friction=20%.")]
 

@@ -245,17 +245,15 @@ def _reached(row) -> str:
     return f"{100 * margin / top:.1f} %" if margin > 0 and top > 0 else DASH
 
 
-_UNSEEN = (("share", "share that holds"), ("margin", "worst margin [N]"))
-_OF = (("", ""), ("_nominal", ", nominal schedule"))
-
-
 def _settings(summary: dict[str, Any]) -> dict[str, str]:
     """How the result was made: all that the summary says beside the result itself."""
     known = {"status", "margin", "message", "phases", "scene", "stopped"}
     named = {"seconds": "time taken [s]", "steps": "steps of descent", "rate_limit": "largest torque rate [N m/s]"}
     named |= {"passing": "least speed at changes, over the mean", "hold_margin": "margin of the holds [N]"}
     named |= {"varied": "varied scenes", "arrival": "arrived within, of the wire's length"}
-    named |= {f"unseen_{key}{of}": f"{what} of unseen scenes{words}" for key, what in _UNSEEN for of, words in _OF}
+    named |= {"unseen_share": "share that holds of unseen scenes", "unseen_margin": "worst margin [N] of unseen scenes"}
+    named |= {"unseen_share_nominal": "share that holds of unseen scenes, nominal schedule"}
+    named |= {"unseen_margin_nominal": "worst margin [N] of unseen scenes, nominal schedule"}
     return {str(named.get(k, k)): _digits(v) for k, v in summary.items() if k not in known and v is not None}
 
 
