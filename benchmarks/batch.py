@@ -161,11 +161,23 @@ def margin_error(done) -> float:
     return float(abs(least["executed"] / least["expected"] - 1))
 
 
+def roll_out(models, starts, torques) -> None:
+    """Drive models from rest at their starts, on all threads."""
+    import mujoco
+    from mujoco import rollout
+
+    state = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    places = np.zeros((len(models), mujoco.mj_stateSize(models[0], state)))
+    places[:, 1:6] = starts  # time, positions, velocities
+    data = [mujoco.MjData(models[0]) for _ in range(os.cpu_count() or 1)]
+    rollout.rollout(models, data, places, torques[None])
+
+
 def rollouts(ensemble, torque) -> dict:
-    """MuJoCo on all threads: rates at the longest time step that still ends near the prediction."""
+    """MuJoCo with its own friction on all threads: rates at the longest time step that still ends near the prediction."""
     from wholearm_jax.execution import clock, execute, motor_torques, start_of
-    from wholearm_jax.free_bodies import Softness, free_bodies
-    from wholearm_jax.perturbation import roll_out, start_near
+    from wholearm_jax.free_bodies import CONVEX, free_bodies
+    from wholearm_jax.perturbation import start_near
 
     prediction = wa.simulate(ensemble.scene, torque)
     course = np.concatenate([np.asarray(t.z) for t in wa.trajectory(prediction)])
@@ -175,11 +187,11 @@ def rollouts(ensemble, torque) -> dict:
     starts = np.stack([start_near(s, start_of(prediction), np.zeros(3)) for s in scenes])
     rows = []
     for wanted in STEPS:
-        done = execute(prediction, timestep=wanted)
+        done = execute(prediction, timestep=wanted, softness=CONVEX)
         begins, step = clock(ensemble.scene, wanted)
-        models = [free_bodies(s, step, Softness()).model for s in scenes]
+        models = [free_bodies(s, step, CONVEX).model for s in scenes]
         begun = time.perf_counter()
-        roll_out(models, starts, motor_torques(torque, begins), None)
+        roll_out(models, starts, motor_torques(torque, begins))
         rate = ROLLOUTS / (time.perf_counter() - begun)
         pose = max(done.position_error / way, abs(done.angle_error) / turn)
         rows.append({"timestep": step, "rate": rate, "pose_error": float(pose), "margin_error": margin_error(done)})

@@ -22,7 +22,8 @@ What counts, by the same tolerances on both sides:
 Forces of an object at rest are not determined, as friction may take any part of them: those of an object that is held,
 or slower than `SLOW` of its phase's mean speed, are judged on neither side.
 
-A prediction is *strict* where no force may be tensile at any moment; agreement is given for that as well.
+A prediction is *strict* where no force may be tensile at any moment; agreement is given for that as well, and for
+executions whose friction is MuJoCo's own, of a convex cone (`CONVEX`).
 Disagreements are executed again with steps of a quarter, and contacts as much harder, and put into classes.
 """
 
@@ -43,6 +44,7 @@ from random_plans import plans as stopping_plans
 
 import wholearm_jax as wa
 from wholearm_jax.execution import Ending, Tolerance, execute, touching
+from wholearm_jax.free_bodies import CONVEX, Softness
 from wholearm_jax.palette import LINK_COLOURS as COLOURS
 from wholearm_jax.phase import destination, end_configuration, start_configuration
 from wholearm_jax.proportion import wilson
@@ -279,9 +281,9 @@ def _squeeze(base: Predicted, chosen: int, rng: np.random.Generator) -> float | 
 # --- executions -------------------------------------------------------------------------------------------------------
 
 
-def executed(predicted: Predicted, timestep: float = TIMESTEP) -> dict:
+def executed(predicted: Predicted, timestep: float = TIMESTEP, softness: Softness = Softness()) -> dict:
     """One execution: whether it holds, where its phases end, and the longest time that a contact was open."""
-    done = execute(predicted.result, timestep=timestep, tolerance=TOLERANCE)
+    done = execute(predicted.result, timestep=timestep, softness=softness, tolerance=TOLERANCE)
     closed = touching(predicted.result.scene, done.names, done.course.z, OPEN)
     free, which, off = 0.0, None, 0.0
     for phase, course in zip(predicted.result.phases, predicted.courses, strict=True):
@@ -295,6 +297,7 @@ def executed(predicted: Predicted, timestep: float = TIMESTEP) -> dict:
     holds = done.ending is Ending.OK and free < FREE and off <= 1
     errors = {"position_error": done.position_error, "angle_error": abs(done.angle_error), "off": off}
     found = {"holds": holds, "ending": done.ending.value, "free": free, "free_contact": which, **errors}
+    found["creep"] = done.creep
     changes = [phase.start for phase in predicted.result.phases if any(phase.impulses)]
     stops = [phase for phase in predicted.result.phases[1:] if not any(phase.impulses) and not _rests(phase)]
     found |= {"impact": max((_impact(done, when) for when in changes), default=0.0)}
@@ -443,6 +446,7 @@ def study(scenes, seed: int, begun: float, note) -> tuple[list[dict], int]:
                 left_out += 1
                 continue
             row = {"plan": f"{sort}: {scene.title}"} | row_of(kind, predicted, executed(predicted))
+            row["convex"] = executed(predicted, softness=CONVEX)["holds"]
             rows.append(row)
             agrees = "" if "class" not in row else f"  DISAGREES: {row['class']}"
             margin = f"{row['margin']:7.3f} N of {row['mean_force']:.2f} N"
@@ -464,9 +468,14 @@ def summarise(rows: list[dict]) -> dict:
         interval = wilson(agreed, len(chosen)) if chosen else (0.0, 1.0)
         return {"agreed": agreed, "of": len(chosen), "rate": agreed / max(len(chosen), 1), "interval_95": interval}
 
-    clear = [row for row in rows if abs(row["margin"]) > CLEAR * row["mean_force"]]
+    def is_clear(row):
+        return abs(row["margin"]) > CLEAR * row["mean_force"]
+
+    clear = [row for row in rows if is_clear(row)]
     strict = [row | {"agrees": row["strict"] == row["executed"]["holds"]} for row in rows]
-    strict_clear = [row for row in strict if abs(row["margin"]) > CLEAR * row["mean_force"]]
+    strict_clear = [row for row in strict if is_clear(row)]
+    convex = [row | {"agrees": row["predicted"] == row["convex"]} for row in rows]
+    convex_clear = [row for row in convex if is_clear(row)]
     by_sort = {
         f"{sort}, {name}": rate([row for row in some if row["plan"].startswith(sort)])
         for sort in SORTS
@@ -481,6 +490,9 @@ def summarise(rows: list[dict]) -> dict:
         "clear": rate(clear),
         "strict_overall": rate(strict),
         "strict_clear": rate(strict_clear),
+        "convex_overall": rate(convex),
+        "convex_clear": rate(convex_clear),
+        "convex_flying_clear": rate([row for row in convex_clear if row["plan"].startswith("flying")]),
         "by_kind": by_kind,
         "by_sort": by_sort,
         "disagreements": dict(classes),

@@ -11,6 +11,7 @@ lies on its feature.
 # pyright: reportAttributeAccessIssue=false
 
 import enum
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from wholearm_jax.contacts import contacts, frames
+from wholearm_jax.coulomb import advance
 from wholearm_jax.free_bodies import FreeBodies, Softness, free_bodies
 from wholearm_jax.phase import destination
 from wholearm_jax.requirements import require_positive
@@ -47,7 +49,7 @@ class Ending(enum.Enum):
     OK = "ok"
     CONTACT_LOST = "contact_lost"  # a contact of the last phase is open
     ASTRAY = "astray"  # all are closed, but the object does not stand where it should
-    DIVERGED = "diverged"  # MuJoCo gave up: too long a time step
+    DIVERGED = "diverged"  # MuJoCo gave up, or contacts crept farther than the tolerance: too long a time step
 
 
 class Event(NamedTuple):
@@ -76,7 +78,8 @@ class Execution:
 
     `course` is what happened, at every step; `expected` what was predicted (NaN: friction holds the object at rest, or
     the prediction ended). Their contacts are `names`, all pairs that may touch; `planned` are those of the phases,
-    which do not say here whether they should roll.
+    which do not say here whether they should roll. `creep` is how far contacts slipped against Coulomb's law, at most
+    [m]: an execution that crept farther than its tolerance diverged.
     """
 
     prediction: Result
@@ -86,6 +89,7 @@ class Execution:
     target: Float[np.ndarray, "5"]
     tolerance: Tolerance
     ending: Ending
+    creep: float
     open_at_end: tuple[str, ...]
     events: tuple[Event, ...]
     timestep: float
@@ -136,7 +140,7 @@ def execute(
     require_wires(prediction)
     times, step = clock(scene, timestep)
     bodies = free_bodies(scene, step, softness)
-    course, sound = drive(bodies, scene, start_of(prediction), motor_torques(prediction.torque, times), step)
+    course, creep = drive(bodies, scene, start_of(prediction), motor_torques(prediction.torque, times), step)
     expected, target = _expected(prediction, bodies.names), target_of(prediction)
     ending, lost = judge(scene, course.z[-1], target, tolerance)
     return Execution(
@@ -146,7 +150,8 @@ def execute(
         names=bodies.names,
         target=target,
         tolerance=tolerance,
-        ending=ending if sound else Ending.DIVERGED,
+        ending=ending if creep <= tolerance.position else Ending.DIVERGED,
+        creep=creep,
         open_at_end=lost,
         events=_events(bodies.names, expected, course),
         timestep=step,
@@ -190,23 +195,44 @@ def target_of(prediction: Result) -> Float[np.ndarray, "5"]:
     return np.asarray(end)
 
 
-def drive(bodies: FreeBodies, scene: Scene, start, torques, timestep: float) -> tuple[Course, bool]:
-    """Step the model from rest at `start`; row `k` of the course is the state before step `k`. False: it diverged."""
-    model, data = bodies.model, mujoco.MjData(bodies.model)
+def drive(bodies: FreeBodies, scene: Scene, start, torques, timestep: float) -> tuple[Course, float]:
+    """Step the model from rest at `start`; row `k` of the course is the state before step `k`.
+
+    The second is how far contacts slipped against Coulomb's law in all steps together, at most [m]; infinite where
+    MuJoCo gave up.
+    """
+    data, step = mujoco.MjData(bodies.model), stepper(bodies)
     count, pairs = len(torques), len(bodies.names)
-    z, z_dot, forces = np.empty((count + 1, 5)), np.empty((count + 1, 5)), np.zeros((count + 1, pairs, 2))
+    z, z_dot, forces = np.empty((count + 1, 5)), np.empty((count + 1, 5)), np.empty((count + 1, pairs, 2))
     data.qpos[:] = start
+    found, creep = np.zeros((pairs, 2)), 0.0
     for k, torque in enumerate(torques):
         z[k], z_dot[k] = data.qpos, data.qvel
-        data.ctrl[:] = torque
-        mujoco.mj_step(model, data)  # its contacts are those of the state before the step
-        _read_forces(bodies, data, forces[k])
+        found, wrong = step(bodies, data, torque, found)
+        forces[k], creep = found, creep + wrong * timestep
     z[count], z_dot[count] = data.qpos, data.qvel
-    mujoco.mj_forward(model, data)
-    _read_forces(bodies, data, forces[count])
+    forces[count], _ = step(bodies, data, torques[-1], found)  # beyond the end, for the forces there
     times = np.arange(count + 1) * timestep
-    sound = not any(warning.number for warning in data.warning)
-    return Course(times, z, z_dot, forces[..., 0], forces[..., 1], touching(scene, bodies.names, z)), sound
+    course = Course(times, z, z_dot, forces[..., 0], forces[..., 1], touching(scene, bodies.names, z))
+    return course, np.inf if gave_up(data) else creep
+
+
+def stepper(bodies: FreeBodies) -> Callable:
+    """`coulomb.advance`, or the same with MuJoCo's own friction."""
+    return advance if bodies.softness.friction == "coulomb" else _advance
+
+
+def _advance(bodies: FreeBodies, data: mujoco.MjData, torque, before):
+    data.ctrl[:] = torque
+    mujoco.mj_step(bodies.model, data)  # its contacts are those of the state before the step
+    forces = np.zeros_like(before)
+    _read_forces(bodies, data, forces)
+    return forces, 0.0
+
+
+def gave_up(data: mujoco.MjData) -> bool:
+    """Whether MuJoCo found numbers that are none, or too large."""
+    return any(warning.number for warning in data.warning)
 
 
 def _read_forces(bodies: FreeBodies, data: mujoco.MjData, into) -> None:

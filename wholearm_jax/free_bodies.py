@@ -17,21 +17,23 @@ A pair thus touches at one point of the plane. If `a_free` is the acceleration o
 
     C_ddot = (1 - d) a_free - d (b C_dot + k C),    b = 2 / (d t_c),  k = 1 / (d t_c^2)        (`Softness`)
 
-critically damped, so that a steady load sags by `(1 - d) a_free t_c^2`. Friction is Coulomb's, in an elliptic cone with
-the link's coefficient; while it sticks, slip dies out at the rate `b_f`.
+critically damped, so that a steady load sags by `(1 - d) a_free t_c^2`. Friction obeys Coulomb's law with the link's
+coefficient (`coulomb`), or, much faster where many models are rolled out together, MuJoCo's convex one.
 """
 
 # MuJoCo's names come from a compiled module, which type checkers cannot see into.
 # pyright: reportAttributeAccessIssue=false
 
 from dataclasses import dataclass
+from typing import Literal
 
 import jax
 import mujoco
 import numpy as np
+from jaxtyping import Float, Int
 
 from wholearm_jax.contacts import every_contact
-from wholearm_jax.scene import EDGE, LINKS, VERTEX, Scene, body, contact_name
+from wholearm_jax.scene import EDGE, LINKS, VERTEX, Scene, body, contact_name, parse_contact
 
 DOT = 1e-5  # radius of a dot [object radii]: far above rounding, its lever arm far below any tolerance
 THICK = 0.2  # slabs, and all shapes in depth [object radii]
@@ -41,38 +43,50 @@ THICK = 0.2  # slabs, and all shapes in depth [object radii]
 class Softness:
     """How contacts give way.
 
-    Time constants are in time steps: `time_constant` t_c of the gap (MuJoCo resolves no fewer than two), and
-    `slip_constant` of the slip, which dies out at the rate `b_f = 1 / (slip_constant * time step)` while friction
-    holds; `impedance` is d in (0, 1), `slip_stiffness` MuJoCo's `impratio`.
+    `time_constant` t_c of the gap is in time steps (MuJoCo resolves no fewer than two), `impedance` is d in (0, 1).
+    `friction` is Coulomb's law (`coulomb.advance`), for which the rest has no meaning, or MuJoCo's own, `"convex"`:
+    an elliptic cone in which slip dies out at the rate `b_f = 1 / (slip_constant * time step)` while friction holds;
+    `slip_stiffness` is MuJoCo's `impratio`.
 
-    Friction is Coulomb's only where slip is faster than `deceleration / b_f`; below that it fades out. An impact at a
-    speed `v_n` decelerates by about `v_n / t_c`: where slip is slower than `mu v_n slip_constant / time_constant`,
-    friction misses part of the impulse that Coulomb's law gives it. But MuJoCo's convex cone couples friction and gap:
-    a contact that slides at `v_t` is lifted by `mu b_f v_t / k`, against the sag above. Where the lift wins, the
-    contact chatters: the more so the harder it is (`d` near 1), the less load it bears, and the smaller
-    `slip_constant`. And a small `d` makes the steps unstable, because MuJoCo's estimate of the inertia that a contact
-    feels leaves out the other contacts: `d` = 0.4 was seen to be so at a `t_c` of two steps, not of three. The defaults
-    lie between; what remains is chatter, by micrometres, of lightly loaded contacts that slide fast.
+    Convex friction is Coulomb's only where slip is faster than `deceleration / b_f`; below that it fades out. An impact
+    at a speed `v_n` decelerates by about `v_n / t_c`: where slip is slower than `mu v_n slip_constant / time_constant`,
+    friction misses part of the impulse that Coulomb's law gives it. But the cone couples friction and gap: a contact
+    that slides at `v_t` is lifted by `mu b_f v_t / k`, against the sag above. Where the lift wins, the contact
+    chatters: the more so the harder it is (`d` near 1), the less load it bears, and the smaller `slip_constant`. And a
+    small `d` makes the steps unstable, because MuJoCo's estimate of the inertia that a contact feels leaves out the
+    other contacts: `d` = 0.4 was seen to be so at a `t_c` of two steps, not of three. `CONVEX` lies between.
     """
 
     time_constant: float = 3.0
-    impedance: float = 0.5
+    impedance: float = 0.9
+    friction: Literal["coulomb", "convex"] = "coulomb"
     slip_constant: float = 30.0
     slip_stiffness: float = 100.0
 
 
+CONVEX = Softness(impedance=0.5, friction="convex")
+"""MuJoCo's own friction, at a compromise between chatter and missing impulses."""
+
+
 @dataclass(frozen=True)
 class FreeBodies:
-    """A compiled model and the names of its contacts.
+    """A compiled model, the names of its contacts, and what Coulomb's friction needs of both.
 
     `pair[geom1, geom2]` is the row of `names` that two shapes belong to (-1: none); `toward[row]` is 1
-    where MuJoCo's contact normal points into the object and -1 where it points out of it. `xml` is the model as MJCF.
+    where MuJoCo's contact normal points into the object and -1 where it points out of it. Each row has its `link` and
+    its `friction` coefficient; `joint` are the fingers' joints [m], and `mobility` is the diagonal of `M^-1`. `xml` is
+    the model as MJCF, always with MuJoCo's friction.
     """
 
     model: mujoco.MjModel
     names: tuple[str, ...]
-    pair: np.ndarray
-    toward: np.ndarray
+    pair: Int[np.ndarray, "geoms geoms"]
+    toward: Int[np.ndarray, "rows"]
+    link: Int[np.ndarray, "rows"]
+    friction: Float[np.ndarray, "rows"]
+    joint: Float[np.ndarray, "2 2"]
+    mobility: Float[np.ndarray, "5"]
+    softness: Softness
     xml: str
 
 
@@ -85,13 +99,28 @@ def free_bodies(scene: Scene, timestep: float, softness: Softness = Softness()) 
     _add_hand(spec, scene.hand, size)
     rows = _add_pairs(spec, solid, timestep, softness)
     model = spec.compile()
+    if softness.friction == "coulomb":
+        model.pair_dim[:] = 1  # normal forces alone
     pair = np.full((model.ngeom, model.ngeom), -1)
     toward = np.ones(len(rows), int)
     for row, ours, other in rows.values():
         first, second = sorted((model.geom(ours).id, model.geom(other).id), key=lambda g: model.geom_type[g])
         pair[first, second] = pair[second, first] = row
         toward[row] = 1 if second == model.geom(ours).id else -1
-    return FreeBodies(model, tuple(rows), pair, toward, spec.to_xml())
+    link = np.array([parse_contact(name)[0] for name in rows])
+    inertia = np.array([solid.mass, solid.mass, solid.inertia, *np.asarray(scene.hand.inertia)])
+    return FreeBodies(
+        model=model,
+        names=tuple(rows),
+        pair=pair,
+        toward=toward,
+        link=link,
+        friction=np.asarray(solid.friction)[link],
+        joint=np.asarray(scene.hand.joint),
+        mobility=1 / inertia,
+        softness=softness,
+        xml=spec.to_xml(),
+    )
 
 
 def _world(scene, timestep, softness):

@@ -11,6 +11,7 @@ torques stay those of the unperturbed plan, and so does the end that counts as s
 # pyright: reportAttributeAccessIssue=false
 
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,19 +21,28 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
-from mujoco import rollout
+from joblib import Parallel, delayed
 
 from wholearm_jax.contacts import gaps, normal_rows
-from wholearm_jax.execution import Ending, Tolerance, clock, judge, motor_torques, require_wires, start_of, target_of
-from wholearm_jax.free_bodies import Softness, free_bodies
+from wholearm_jax.execution import (
+    Ending,
+    Tolerance,
+    clock,
+    gave_up,
+    judge,
+    motor_torques,
+    require_wires,
+    start_of,
+    stepper,
+    target_of,
+)
+from wholearm_jax.free_bodies import FreeBodies, Softness, free_bodies
 from wholearm_jax.outline import stays_simple
 from wholearm_jax.proportion import wilson
 from wholearm_jax.requirements import require_positive
 from wholearm_jax.result import Result
 from wholearm_jax.scene import Formation, Scene, body
 from wholearm_jax.system import system
-
-CHUNK = 64  # executions that are kept in memory at once
 
 
 class Amounts(NamedTuple):
@@ -91,9 +101,9 @@ def perturb(
     timestep: float = 2e-4,
     softness: Softness = Softness(),
     tolerance: Tolerance = Tolerance(),
-    threads: int | None = None,
+    workers: int | None = None,
 ) -> Robustness:
-    """Execute `count` perturbed copies of a plan on `threads` threads (default: every processor).
+    """Execute `count` perturbed copies of a plan in `workers` processes (default: one for each processor).
 
     Raises ValueError as `require_wires` and `require_objects` do, and for numbers that are not positive.
     """
@@ -106,15 +116,16 @@ def perturb(
     begins, step = clock(prediction.scene, timestep)
     torques = motor_torques(prediction.torque, begins)
     nominal, target = start_of(prediction), target_of(prediction)
+
+    def copies():
+        for scene, shift in zip(scenes, shifts, strict=True):
+            yield free_bodies(scene, step, softness), start_near(scene, nominal, shift)
+
+    found = roll_out(copies(), torques, min(workers or os.cpu_count() or 1, count))
     runs = []
-    for first in range(0, count, CHUNK):
-        few = scenes[first : first + CHUNK]
-        starts = [start_near(s, nominal, shift) for s, shift in zip(few, shifts[first:], strict=False)]
-        models = [free_bodies(s, step, softness).model for s in few]
-        ends = roll_out(models, np.stack(starts), torques, threads)
-        for s, end in zip(few, ends, strict=True):
-            ending, _ = judge(s, end, target, tolerance)
-            runs.append(_summary(prediction.scene, s, end, target, ending))
+    for scene, (end, creep) in zip(scenes, found, strict=True):
+        ending = judge(scene, end, target, tolerance)[0] if creep <= tolerance.position else Ending.DIVERGED
+        runs.append(_summary(prediction.scene, scene, end, target, ending))
     return Robustness(amounts, seed, tolerance, tuple(runs))
 
 
@@ -161,14 +172,22 @@ def _touch_down(shape, hand, gravity, formation: Formation, z, shift) -> Float[A
     return jax.lax.fori_loop(0, 20, closer, displaced) * mechanics.configuration_unit
 
 
-def roll_out(models, starts, torques, threads: int | None) -> Float[np.ndarray, "runs 5"]:
-    """Where each model ends, driven from rest at its start."""
-    state = mujoco.mjtState.mjSTATE_FULLPHYSICS
-    places = np.zeros((len(models), mujoco.mj_stateSize(models[0], state)))
-    places[:, 1:6] = starts  # time, positions, velocities
-    data = [mujoco.MjData(models[0]) for _ in range(min(threads or os.cpu_count() or 1, len(models)))]
-    states, _ = rollout.rollout(models, data, places, torques[None])
-    return np.asarray(states)[:, -1, 1:6]
+def roll_out(
+    copies: Iterable[tuple[FreeBodies, Float[np.ndarray, "5"]]], torques, workers: int
+) -> list[tuple[Float[np.ndarray, "5"], float]]:
+    """Where free bodies end, driven from rest at their starts, and how far their contacts crept (`execution.drive`)."""
+    each = (delayed(_end)(bodies, start, torques) for bodies, start in copies)
+    return list(Parallel(n_jobs=workers)(each))  # pyright: ignore[reportReturnType]
+
+
+def _end(bodies: FreeBodies, start, torques) -> tuple[Float[np.ndarray, "5"], float]:
+    data, step = mujoco.MjData(bodies.model), stepper(bodies)
+    data.qpos[:] = start
+    forces, creep = np.zeros((len(bodies.names), 2)), 0.0
+    for torque in torques:
+        forces, wrong = step(bodies, data, torque, forces)
+        creep += wrong * bodies.model.opt.timestep
+    return np.array(data.qpos), np.inf if gave_up(data) else creep
 
 
 def _summary(scene: Scene, changed: Scene, end, target, ending: Ending) -> Perturbed:

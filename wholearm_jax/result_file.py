@@ -130,11 +130,19 @@ def summary(result: Result, *, bounds: tuple[float, ...] | None = None, **more: 
 def execution_summary(execution: Execution, robustness: Robustness | None = None, **more: Any) -> dict[str, Any]:
     """What became of an execution, and of its perturbed copies, as the file `execution.json` holds it."""
     head = {"status": execution.ending.value, "message": execution.message}
-    errors = {"position_error": execution.position_error, "angle_error": execution.angle_error}
+    errors = {
+        "position_error": execution.position_error,
+        "angle_error": execution.angle_error,
+        "creep": execution.creep,
+    }
     within = {"tolerance": execution.tolerance._asdict(), "open_at_end": list(execution.open_at_end)}
     events = [event._asdict() for event in execution.events]
     prediction = {"status": execution.prediction.status.label, "margin": execution.prediction.margin}
-    row = _plain(head | errors) | within | {"events": events, "prediction": _plain(prediction)}
+    row = (
+        _plain(head | errors | {"creep": execution.creep})
+        | within
+        | {"events": events, "prediction": _plain(prediction)}
+    )
     if robustness is not None:
         low, high = robustness.interval
         row["perturbed"] = {
