@@ -174,7 +174,7 @@ def roll_out(models, starts, torques) -> None:
 
 
 def rollouts(ensemble, torque) -> dict:
-    """MuJoCo with its own friction on all threads: rates at the longest time step that still ends near the prediction."""
+    """MuJoCo, its own friction, all threads: rates at the longest time step that still ends near the prediction."""
     from wholearm_jax.execution import clock, execute, motor_torques, start_of
     from wholearm_jax.free_bodies import CONVEX, free_bodies
     from wholearm_jax.perturbation import start_near

@@ -190,8 +190,8 @@ def test_ends_where_predicted(name, executions):
     done = executions[name]
     assert done.ending is Ending.OK
     assert done.timestep == pytest.approx(2e-4, rel=1e-12)
-    assert done.position_error < 1e-4
-    assert abs(done.angle_error) < 1e-3
+    assert done.position_error < 3e-5
+    assert abs(done.angle_error) < 1e-4
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -206,6 +206,18 @@ def test_forces_are_those_predicted(name, executions):
             assert done.force(contact)[middle].mean() == pytest.approx(predicted, rel=0.01), contact
             tangential = np.interp(done.expected.time, done.course.time, done.course.ct[:, row])[middle].mean()
             assert tangential == pytest.approx(done.expected.ct[middle, row].mean(), abs=0.01 * predicted), contact
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_least_force_is_that_predicted(name, predictions):
+    """Of all contacts of each phase, whose first and last twentieth are left out, to 1 % at a step of 0.1 ms."""
+    done = execute(predictions[name], timestep=1e-4)
+    for phase in done.prediction.phases:
+        inside = np.abs(done.expected.time - phase.start - phase.duration / 2) < 0.45 * phase.duration
+        rows = [done.names.index(contact) for contact in phase.contacts]
+        predicted = done.expected.cn[inside][:, rows].min()
+        executed = min(done.force(contact)[inside].min() for contact in phase.contacts)
+        assert executed == pytest.approx(predicted, rel=0.01)
 
 
 @pytest.mark.parametrize(("name", "new"), [("heptagon", "palm:v0"), ("hexagon", "palm:v1")])
@@ -403,13 +415,13 @@ def test_command(wholearm, tmp_path):
 
 def test_a_contact_that_rolls_is_executed(wholearm, tmp_path):
     """An object tips over a vertex that should not slip, and back; nothing in the execution says that it must roll."""
-    # On its vertex the object is unstable: deviations grow four hundred times until it lies again.
-    torque = ("--torque", DATA / "tipping_torque.csv", "--timestep", 1e-4)
+    torque = ("--torque", DATA / "tipping_torque.csv")
     code, out, err = wholearm("execute", "tipping", *torque, "--out", tmp_path)
     assert (code, err) == (0, ""), out
     content = json.loads((tmp_path / "execution.json").read_text())
-    assert content["position_error"] < 5e-4
-    assert abs(content["angle_error"]) < 0.01
+    assert content["position_error"] < 2e-5  # on its vertex it is unstable: what it starts with grows 400 times
+    assert abs(content["angle_error"]) < 1e-3
+    assert 0 <= content["creep"] < 1e-6
     header, *rows = (tmp_path / "execution.csv").read_text().splitlines()
     column = header.split(",").index("cn palm:v0")
     assert np.median([float(row.split(",")[column]) for row in rows]) > 1.0

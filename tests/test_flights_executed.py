@@ -11,5 +11,5 @@ def test_flights_end_where_predicted(name):
     found = wa.optimise(wa.load(name))
     assert found.result.status is wa.Status.OK
     done = execute(found.result, timestep=2e-4)
-    assert done.position_error < 5e-4
-    assert done.angle_error < 0.01
+    assert done.position_error < 5e-5
+    assert abs(done.angle_error) < 1e-3

@@ -36,6 +36,7 @@ from wholearm_jax.contacts import every_contact
 from wholearm_jax.scene import EDGE, LINKS, VERTEX, Scene, body, contact_name, parse_contact
 
 DOT = 1e-5  # radius of a dot [object radii]: far above rounding, its lever arm far below any tolerance
+NEAR = 1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
 THICK = 0.2  # slabs, and all shapes in depth [object radii]
 
 
@@ -97,7 +98,7 @@ def free_bodies(scene: Scene, timestep: float, softness: Softness = Softness()) 
     spec = _world(scene, timestep, softness)
     _add_object(spec, solid, size)
     _add_hand(spec, scene.hand, size)
-    rows = _add_pairs(spec, solid, timestep, softness)
+    rows = _add_pairs(spec, solid, size, timestep, softness)
     model = spec.compile()
     if softness.friction == "coulomb":
         model.pair_dim[:] = 1  # normal forces alone
@@ -198,7 +199,7 @@ def _add_geom(owner, name, kind, size, position, **more):
     owner.add_geom(name=name, type=shape, size=size, pos=position, contype=0, conaffinity=0, **more)
 
 
-def _add_pairs(spec, solid, timestep, softness):
+def _add_pairs(spec, solid, size, timestep, softness):
     """Declare all pairs that may touch; name -> (row, the object's shape, the hand's shape)."""
     pairs, rows = every_contact(len(solid.vertices)), {}
     columns = (np.asarray(a).tolist() for a in (pairs.link, pairs.kind, pairs.feature))
@@ -215,6 +216,7 @@ def _add_pairs(spec, solid, timestep, softness):
             geomname1=ours,
             geomname2=other,
             condim=3,
+            margin=NEAR * size,
             friction=[float(solid.friction[link])] * 2 + [0, 0, 0],
             solref=[softness.time_constant * timestep, 1.0],
             solreffriction=[0.0, -b * d],
