@@ -15,7 +15,7 @@ from wholearm_jax.scene import Scene
 from wholearm_jax.schedule import Torque
 from wholearm_jax.stepping import Integration, tolerance_as_data
 
-FORWARD = 4
+FORWARD = 2
 
 
 def torque_gradient(

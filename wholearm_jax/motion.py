@@ -29,7 +29,7 @@ from wholearm_jax.lookup import pick
 from wholearm_jax.reduction import Table, on_panel, powers
 from wholearm_jax.schedule import Window, interval, torque_in
 from wholearm_jax.status import Status
-from wholearm_jax.stepping import Integration, Steps, found, repeated
+from wholearm_jax.stepping import Integration, Steps, found, repeated, reversible
 
 
 class Motion(eqx.Module):
@@ -220,24 +220,36 @@ def _recorded(state: _State, steps: Steps, overshot, room):
 
 def _integrate(table, seen, duration, how, state, final, goal, floor) -> Steps:
     """Steps from the state to `final` or to the first that passes `goal` or falls below the speed `floor`."""
+    limits, final = stop_gradient(((goal, floor), final))
+    way = limits[0] - stop_gradient(state.s)
+    parameters = table, seen, duration, state.piece
+    begin, y = state.share, jnp.stack([state.s, state.w])
+    if how.adjoint == "reverse":
+        return reversible((parameters, seen, begin, y), _field, _past, how, final, limits, way)
 
-    def solve(method, inputs, *more):
-        table, seen, duration, share, y0 = inputs
+    def solve(method, parameters, seen, begin, y, *more):
+        return method(_field(parameters), seen, how, begin, final, y, *more)
 
-        def field(u, y, row):
-            return jnp.stack([y[1], acceleration(table, seen, duration, state.piece, row, u, y[0], y[1])])
-
-        return method(field, seen, how, share, final, y0, *more)
-
-    goal, final = stop_gradient((goal, final))
-
-    def past(y):
-        return (y[0] > goal) | (y[1] < floor)
-
-    inputs = (table, seen, duration, state.share, jnp.stack([state.s, state.w]))
+    inputs = parameters, seen, begin, y
     fixed = inputs if how.adjoint == "none" else stop_gradient(inputs)
-    steps = solve(found, fixed, past, goal - stop_gradient(state.s))
-    return steps if how.adjoint == "none" else solve(repeated, inputs, steps)
+    steps = solve(found, *fixed, _past(limits), way)
+    return steps if how.adjoint == "none" else solve(repeated, *inputs, steps)
+
+
+def _field(parameters):
+    """`d(s, w)/du` in a piece, for `stepping`."""
+    table, seen, duration, piece = parameters
+
+    def field(u, y, row):
+        return jnp.stack([y[1], acceleration(table, seen, duration, piece, row, u, y[0], y[1])])
+
+    return field
+
+
+def _past(limits):
+    """Whether a state passes the goal, or falls below a speed."""
+    goal, floor = limits
+    return lambda y: (y[0] > goal) | (y[1] < floor)
 
 
 def _append(state, wanted, share, s, w, entry_w, row, *, held):

@@ -22,9 +22,9 @@ from wholearm_jax.lookup import pick
 from wholearm_jax.precision import array
 from wholearm_jax.schedule import Window, interval, rounded
 
-Loop = Literal["lax", "checkpointed", "bounded"]
-LOOPS: dict[str, Loop] = {"none": "lax", "forward": "lax", "reverse": "checkpointed", "both": "bounded"}
-"""Equinox's loop that serves each adjoint: a `bounded` one passes both modes, the others one of them."""
+Loop = Literal["lax", "bounded"]
+LOOPS: dict[str, Loop] = {"none": "lax", "forward": "lax", "reverse": "bounded", "both": "bounded"}
+"""Equinox's loop that serves each adjoint: what is `bounded` passes reverse mode, too."""
 
 
 class Integration(eqx.Module):
@@ -32,10 +32,10 @@ class Integration(eqx.Module):
 
     `steps` says that the torque schedule has steps inside the phase. `adjoint` says what the solve will be
     differentiated by: `"none"`, `"forward"`, `"reverse"` (which keeps one state a step and computes each step again on
-    its way back) or `"both"` (which keeps every stage). For all but the first the steps are found once by their errors
-    and taken again as they are: through rejected steps reverse mode gives wrong derivatives (seen with diffrax 0.7.2),
-    and through the choice of steps forward mode erratic ones (off by up to 3 % at any tolerance). All but a `tolerance`
-    that is an array is static: each choice is a program of its own. The package's own programs get theirs as data.
+    its way back) or `"both"` (which keeps every stage). Steps are found by their errors and then differentiated as they
+    are: through rejected steps reverse mode gives wrong derivatives (seen with diffrax 0.7.2), and through the choice
+    of steps forward mode erratic ones (off by up to 3 % at any tolerance). All but a `tolerance` that is an array is
+    static: each choice is a program of its own. The package's own programs get theirs as data.
     """
 
     solver: dfx.AbstractSolver = eqx.field(static=True, default=dfx.Dopri8())
@@ -150,8 +150,7 @@ def found(
 def repeated(field: Callable, seen: Window, how: Integration, begin, final, y, steps: Steps) -> Steps:
     """Steps that were `found`, taken again; those that end on a knot move with it."""
     count, row = steps.count, steps.row
-    knot = seen.share[row + 1]
-    ends = jnp.where((steps.end == stop_gradient(knot)) & (steps.end < final), knot, steps.end)
+    ends = _ends(seen, steps, final)
     # A batch goes on until its last member has finished: the others take steps of no length.
     ends = jnp.where(jnp.arange(how.max_steps) < count, ends, ends[jnp.maximum(count - 1, 0)])
     ends = jnp.where(count > 0, ends, begin)
@@ -174,9 +173,65 @@ def repeated(field: Callable, seen: Window, how: Integration, begin, final, y, s
     return steps._replace(end=ends, y=ys)
 
 
+def _ends(seen: Window, steps: Steps, final):
+    """When steps end: on a knot, or at a time of their own."""
+    knot = seen.share[steps.row + 1]
+    return jnp.where((steps.end == stop_gradient(knot)) & (steps.end < final), knot, stop_gradient(steps.end))
+
+
+@eqx.filter_custom_vjp
+def reversible(inputs, field_of: Callable, past_of: Callable, how: Integration, final, limits, way) -> Steps:
+    """`found`, of `field_of(parameters)` until `past_of(limits)`, whose reverse mode goes back over its own steps.
+
+    `inputs` are `(parameters, seen, begin, y)`, what it can be differentiated by. Each step is computed once more on
+    the way back, from where it began, and none on the way there.
+    """
+    parameters, seen, begin, y = inputs
+    return found(field_of(parameters), seen, how, begin, final, y, past_of(limits), way)
+
+
+@reversible.def_fwd
+def _forth(_, inputs, field_of, past_of, how, final, limits, way):
+    # Derivatives of a gradient would miss how the states between steps move.
+    parameters, seen, begin, y = eqxi.nondifferentiable(inputs)
+    steps = found(field_of(parameters), seen, how, begin, final, y, past_of(limits), way)
+    return steps, steps
+
+
+@reversible.def_bwd
+def _back(steps: Steps, gradient: Steps, perturbed, inputs, field_of, past_of, how, final, limits, way):
+    parameters, seen, begin, y = inputs
+    moved, kept = eqx.partition((parameters, seen, begin), perturbed[:3])
+    solver = solver_of(how)
+    ys = jnp.concatenate([y[None], steps.y[:-1]])
+    onto_end, onto_y = (
+        jnp.zeros_like(value) if slope is None else slope
+        for value, slope in zip((steps.end, steps.y), (gradient.end, gradient.y), strict=True)
+    )
+
+    def step(moved, y, k):
+        parameters, seen, begin = eqx.combine(moved, kept)
+        ends = _ends(seen, steps, final)
+        begin = jnp.where(k > 0, pick(ends, jnp.maximum(k - 1, 0)), begin)
+        term, end, row = dfx.ODETerm(field_of(parameters)), pick(ends, k), pick(steps.row, k)
+        reused = solver.init(term, begin, end, y, row)
+        return end, solver.step(term, begin, end, y, row, reused, made_jump=False)[0]
+
+    def before(at):
+        k, onto, total = at
+        _, pull = jax.vjp(lambda moved, y: step(moved, y, k), moved, pick(ys, k))
+        share, onto = pull((pick(onto_end, k), onto + pick(onto_y, k)))
+        return k - 1, onto, jax.tree.map(jnp.add, total, share)
+
+    none = jax.tree.map(jnp.zeros_like, moved)
+    start = steps.count - 1, jnp.zeros_like(y), none
+    _, onto, total = jax.lax.while_loop(lambda at: at[0] >= 0, before, start)
+    return *total, onto
+
+
 def solver_of(how: Integration) -> dfx.AbstractSolver:
     """The solver, with a loop over its stages that may be differentiated as `how` says."""
-    return _with_stages(how.solver, "lax" if LOOPS[how.adjoint] == "lax" else "bounded")
+    return _with_stages(how.solver, LOOPS[how.adjoint])
 
 
 def _with_stages(solver: dfx.AbstractSolver, kind: Loop) -> dfx.AbstractSolver:
