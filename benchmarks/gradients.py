@@ -5,7 +5,7 @@ r"""What the gradient of a phase's margin costs, and how exact it is.
 The margin of one phase (move, then score) and its derivatives with respect to the torques at `n` knots, `2 n` numbers:
 
     forward   `jax.jacfwd` through the solve, all directions at once
-    reverse   `jax.value_and_grad` back over the steps that the solve took, each computed once more (`adjoint="reverse"`)
+    reverse   `jax.value_and_grad` back over the steps that the solve took, each computed once more
     direct    `jax.value_and_grad` through a solve that keeps every step (`adjoint="both"`)
 
 Times are those of value and gradient together, as multiples of the margin alone, warm and in turn; compile times are
