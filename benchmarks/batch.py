@@ -114,7 +114,7 @@ def same_geometry(torque) -> dict:
 def gradients(ensemble, torque) -> dict:
     """Checks with the gradient with respect to all torques, a block at a time."""
     schedule, how = padded(torque), QUICK.how
-    level = QUICK._replace(how=replace(how, adjoint="both", steps=bool(np.any(np.diff(torque.times) == 0))))
+    level = QUICK._replace(how=replace(how, adjoint="reverse", steps=bool(np.any(np.diff(torque.times) == 0))))
 
     def one(number):
         def margin(values):

@@ -1,6 +1,6 @@
 """Does the prediction hold? Hundreds of random plans, predicted by the model and executed by free bodies in MuJoCo.
 
-    python benchmarks/prediction.py [--pausing 50] [--stopping 20] [--flying 15] [--seed 0] [--quick]
+    python benchmarks/prediction.py [--pausing 60] [--stopping 20] [--flying 20] [--seeds 0 1] [--quick]
 
 Plans of two phases (`random_plans`) get optimised and quasi-static torques in turn. Half way they hold the object for
 `PAUSE`, or, to see what that is worth, stop and go on at once. Plans of three phases that do not stop (`flying_plans`)
@@ -22,7 +22,8 @@ What counts, by the same tolerances on both sides:
 Forces of an object at rest are not determined, as friction may take any part of them: those of an object that is held,
 or slower than `SLOW` of its phase's mean speed, are judged on neither side.
 
-A prediction is *strict* where no force may be tensile at any moment; agreement is given for that as well, and for
+A prediction is *clear* where its least force is farther from zero than `CLEAR` of the mean force; that its end is
+farther from the tolerance's limit by as much is asked apart (`clear_ends`). It is *strict* where no force may be tensile at any moment; agreement is given for that as well, and for
 executions whose friction is MuJoCo's own, of a convex cone (`CONVEX`).
 Disagreements are executed again with steps of a quarter, and contacts as much harder, and put into classes.
 """
@@ -75,7 +76,7 @@ LAST = 0.03  # share of a phase that is its wire's end
 AROUND, KICK = 0.01, 0.01  # [s] before and after an impact, and share of the speed by which it is off, that count
 UNIT = np.array([0.04, 0.04, 1.0, 1.0, 1.0])  # of configurations: the objects' radius, about [m], and radians
 PLACES = 1001  # samples a phase
-SORTS = {"pausing": 50, "stopping": 20, "flying": 15}  # and how many of each by default
+SORTS = {"pausing": 60, "stopping": 20, "flying": 20}  # and how many of each by default, a seed
 UNDECIDED = {Status.AMBIGUOUS, Status.SINGULAR, Status.NO_CONVERGENCE, Status.MAX_STEPS}
 
 
@@ -445,7 +446,7 @@ def study(scenes, seed: int, begun: float, note) -> tuple[list[dict], int]:
             if kind == "left out":
                 left_out += 1
                 continue
-            row = {"plan": f"{sort}: {scene.title}"} | row_of(kind, predicted, executed(predicted))
+            row = {"seed": seed, "plan": f"{sort}: {scene.title}"} | row_of(kind, predicted, executed(predicted))
             row["convex"] = executed(predicted, softness=CONVEX)["holds"]
             rows.append(row)
             agrees = "" if "class" not in row else f"  DISAGREES: {row['class']}"
@@ -483,16 +484,19 @@ def summarise(rows: list[dict]) -> dict:
     }
     classes = Counter(row["class"] for row in rows if "class" in row)
     clear_classes = Counter(row["class"] for row in clear if "class" in row)
+    by_seed = {seed: rate([row for row in clear if row["seed"] == seed]) for seed in sorted({r["seed"] for r in rows})}
     by_kind = {kind: rate([row for row in rows if row["kind"] == kind]) for kind in sorted({r["kind"] for r in rows})}
     return {
         "confusion": matrix,
         "overall": rate(rows),
         "clear": rate(clear),
+        "clear_ends": rate([row for row in clear if abs(row["off"] - 1) > CLEAR]),
         "strict_overall": rate(strict),
         "strict_clear": rate(strict_clear),
         "convex_overall": rate(convex),
         "convex_clear": rate(convex_clear),
         "convex_flying_clear": rate([row for row in convex_clear if row["plan"].startswith("flying")]),
+        "clear_by_seed": by_seed,
         "by_kind": by_kind,
         "by_sort": by_sort,
         "disagreements": dict(classes),
@@ -525,27 +529,36 @@ def draw(rows: list[dict]) -> plt.Figure:
     return figure
 
 
+def keep(rows: list[dict], left_out: int) -> None:
+    """Write what was found, and draw it."""
+    counts = {"plans": len({(row["seed"], row["plan"]) for row in rows}), "executions": len(rows), "left_out": left_out}
+    limits = {"free": FREE, "open": OPEN, "timestep": TIMESTEP, **TOLERANCE._asdict(), "clear": CLEAR}
+    save("prediction", {**counts, **limits, **summarise(rows), "rows": rows})
+    draw(rows).savefig(RESULTS / "prediction.svg", bbox_inches="tight")
+    plt.close("all")
+
+
 def main() -> None:
     wa.configure()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for sort, count in SORTS.items():
         parser.add_argument(f"--{sort}", type=int, default=count, help=f"{sort} plans")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1], help="one study each, together")
     parser.add_argument("--quick", action="store_true", help="a few plans; nothing is written")
     given = parser.parse_args()
     wanted = {sort: 1 if given.quick else getattr(given, sort) for sort in SORTS}
     begun = time.perf_counter()
 
-    def note(rows, left_out):
-        if not given.quick:
-            counts = {"plans": len({row["plan"] for row in rows}), "executions": len(rows), "left_out": left_out}
-            limits = {"free": FREE, "open": OPEN, "timestep": TIMESTEP, **TOLERANCE._asdict(), "clear": CLEAR}
-            save("prediction", {"seed": given.seed, **counts, **limits, **summarise(rows), "rows": rows})
-            draw(rows).savefig(RESULTS / "prediction.svg", bbox_inches="tight")
-            plt.close("all")
+    rows, left_out = [], 0
 
-    rows, left_out = study(_plans(given.seed, wanted), given.seed, begun, note)
-    note(rows, left_out)
+    def note(more, more_left_out):
+        if not given.quick:
+            keep([*rows, *more], left_out + more_left_out)
+
+    for seed in given.seeds:
+        found = study(_plans(seed, wanted), seed, begun, note)
+        rows, left_out = [*rows, *found[0]], left_out + found[1]
+        note([], 0)
     for name, value in summarise(rows).items():
         print(name, value)
 

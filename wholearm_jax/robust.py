@@ -33,7 +33,7 @@ from wholearm_jax.verdict import BRAKING
 from wholearm_jax.wire import Resolution
 
 COARSE = Resolution(6, 24, 8)
-HOW = Integration(tolerance=1e-7, max_steps=128, stages=6, adjoint="both")
+HOW = Integration(tolerance=1e-7, max_steps=128, stages=6, adjoint="reverse")
 WITHIN = 0.5  # share of the tolerance of arrival that the climb leaves as it is
 NONE = -10.0  # margin [N] of a phase without any motion
 TEMPERATURE = 0.02  # of the smooth minimum, as a share of the nominal margin
