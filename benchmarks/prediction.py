@@ -23,8 +23,9 @@ Forces of an object at rest are not determined, as friction may take any part of
 or slower than `SLOW` of its phase's mean speed, are judged on neither side.
 
 A prediction is *clear* where its least force is farther from zero than `CLEAR` of the mean force; that its end is
-farther from the tolerance's limit by as much is asked apart (`clear_ends`). It is *strict* where no force may be tensile at any moment; agreement is given for that as well, and for
-executions whose friction is MuJoCo's own, of a convex cone (`CONVEX`).
+farther from the tolerance's limit by as much is asked apart (`clear_ends`). It is *strict* where no force may be
+tensile at any moment; agreement is given for that as well, and for executions whose friction is MuJoCo's own, of a
+convex cone (`CONVEX`).
 Disagreements are executed again with steps of a quarter, and contacts as much harder, and put into classes.
 """
 
