@@ -358,10 +358,13 @@ def test_an_end_is_judged_by_place_angle_and_contacts(off, ending, predictions):
     assert far is not Ending.OK
 
 
-def test_a_simulation_that_diverges_is_said(predictions, monkeypatch):
+@pytest.mark.parametrize(("creep", "why"), [(np.inf, "MuJoCo gave up"), (6e-4, "contacts crept 0.6 mm")])
+def test_a_simulation_that_diverges_is_said(creep, why, predictions, monkeypatch):
     honest = execution.drive
-    monkeypatch.setattr(execution, "drive", lambda *a: (honest(*a)[0], np.inf))
-    assert execute(predictions["heptagon"], timestep=1e-3).ending is Ending.DIVERGED
+    monkeypatch.setattr(execution, "drive", lambda *a: (honest(*a)[0], creep))
+    done = execute(predictions["heptagon"], timestep=1e-3)
+    assert done.ending is Ending.DIVERGED
+    assert done.message.startswith(f"diverged ({why}: take a shorter time step), ")
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 10), (8, 10), (10, 10), (187, 200)])

@@ -114,8 +114,11 @@ class Execution:
     def message(self) -> str:
         """What became of the execution, in one line."""
         off = f"{1e3 * self.position_error:.3g} mm and {abs(self.angle_error):.2g} rad from the predicted end"
-        lost = f" at {', '.join(self.open_at_end)}" if self.open_at_end else ""
-        return f"{self.ending.value}{lost}, {off}"
+        why = f" at {', '.join(self.open_at_end)}" if self.open_at_end else ""
+        if self.ending is Ending.DIVERGED:
+            crept = f"contacts crept {1e3 * self.creep:.3g} mm"
+            why = f" ({crept if np.isfinite(self.creep) else 'MuJoCo gave up'}: take a shorter time step)"
+        return f"{self.ending.value}{why}, {off}"
 
     def force(self, contact: str, times=None) -> Float[np.ndarray, "times"]:
         """A contact's executed normal force [N] at given times, by default those of `expected`."""
