@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import equinox as eqx
+import numpy as np
 import pytest
 
 import wholearm_jax as wa
@@ -45,6 +46,23 @@ def test_the_worst_margin_of_unseen_scenes_is_larger(found):
 def test_the_best_on_the_samples_is_kept(found):
     nominal, robust = found.seen
     assert (robust.share, robust.margin) > (nominal.share, nominal.margin)
+
+
+def test_what_is_told_of_scenes_is_what_checks_find(slide):
+    both = wa.read_torque(Path(__file__).parent / "data" / "heptagon_torque.csv")
+    nominal = wa.torque(both.times[:51], both.values[:51])
+    varied = vary(slide, {"friction": "20%"}, seed=1)
+    settings = {"samples": 12, "steps": 1, "quantile": 0.4, "arrival": 0.02}
+    found = optimise_robustly(varied, nominal=nominal, **settings)
+    checked = wa.check(varied, nominal, count=24, arrival=0.02)
+    for held, rows in ((found.seen[0], slice(0, 12)), (found.unseen[0], slice(12, 24))):
+        assert held.share == (checked.status[rows] == 0).mean()
+        assert held.margin == pytest.approx(np.sort(checked.margin[rows])[4], abs=1e-5)
+
+
+def test_numbers_of_samples_and_steps_are_asked_for(slide):
+    with pytest.raises(ValueError, match="steps must be positive"):
+        optimise_robustly(vary(slide, {"friction": "20%"}, seed=1), steps=0)
 
 
 def test_every_step_is_told(found, told):

@@ -25,6 +25,7 @@ from wholearm_jax.optimiser import optimise
 from wholearm_jax.phase import Traced
 from wholearm_jax.plan import outcomes, require_motion, roomy, steps_within, trace
 from wholearm_jax.programs import Program
+from wholearm_jax.requirements import require_positive
 from wholearm_jax.schedule import Torque
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
@@ -74,9 +75,10 @@ def optimise_robustly(
 
     `rate` is the step of Adam as a share of the torque limits. `nominal` starts from another schedule than
     `optimise(ensemble.scene)` finds. `callback` sees each step's number and how its schedule does on the samples.
-    Raises ValueError for a plan that holds its object in a phase.
+    Raises ValueError for a plan that holds its object in a phase, and for numbers that are not positive.
     """
     scene = ensemble.scene
+    require_positive(samples=samples, knots=knots, steps=steps, arrival=arrival, rate=rate)
     require_motion(scene)
     start = optimise(scene, knots=knots).torque if nominal is None else nominal
     seen, unseen = (_traced(ensemble, jnp.arange(samples) + first) for first in (0, samples))
@@ -86,7 +88,7 @@ def optimise_robustly(
         return _climb(torque, scene, traced, jnp.asarray(arrival, float), how)
 
     def held(found) -> Held:
-        return Held(float(found.holds.mean()), float(jnp.quantile(found.margins, quantile, method="lower")))
+        return Held(float(np.asarray(found.holds).mean()), float(jnp.quantile(found.margins, quantile, method="lower")))
 
     limit = scene.hand.torque_limit
     adam = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.05))
