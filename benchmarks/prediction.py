@@ -1,14 +1,15 @@
 """Does the prediction hold? Hundreds of random plans, predicted by the model and executed by free bodies in MuJoCo.
 
-    python benchmarks/prediction.py [--pausing 60] [--stopping 20] [--flying 20] [--seeds 0 1] [--quick]
+    python benchmarks/prediction.py [--pausing 30] [--stopping 10] [--flying 20] [--seeds 0 1] [--quick]
 
 Plans of two phases (`random_plans`) get optimised and quasi-static torques in turn. Half way they hold the object for
 `PAUSE`, or, to see what that is worth, stop and go on at once. Plans of three phases that do not stop (`flying_plans`)
 get optimised torques. These are then spoiled. A *squeeze* adds torques along the one direction that leaves the motion
 as it is, as many as move the predicted least force to a place drawn evenly on both sides of zero. A *push* adds torques
 along the other direction, so that the object falls short. Variants are drawn until a plan has two that are predicted to
-hold and two to fail, or the draws are used up. One that is predicted to reach a wire's end early, and at speed, is left
-out: its plan says nothing about the impact that follows.
+hold and two to fail, or the draws are used up. Left out is one that is predicted to reach a wire's end early, and at
+speed: its plan says nothing about the impact that follows; and one in which a phase that others follow ends more than
+`PASSED` short of its wire, but within the tolerance: the next formation's contacts are open there.
 
 What counts, by the same tolerances on both sides:
 
@@ -62,7 +63,7 @@ TOLERANCE = Tolerance()
 FREE = 5e-3  # [s] for which a lost contact is tensile, or open; shorter is chatter of the contact's softness
 OPEN = 2e-6  # [m] gap above which an executed contact is open
 MARGIN_OF_TIME = 0.02  # [s] at either end of a phase, while formations change, in which forces are not judged
-PASSED = 0.02  # distance from its wire's end, over the tolerance, within which a phase that passes on has reached it
+PASSED = 0.02  # distance from its wire's end, over the tolerance, within which a phase that others follow reached it
 HURRY, EARLY = 0.1, 0.05  # speed over the mean speed, and share of the phase left, with which a wire's end is too early
 SLOW = 0.02  # speed over the mean speed below which an object counts as at rest
 PAUSE = 0.1  # [s] for which a pausing plan holds the object
@@ -77,7 +78,7 @@ LAST = 0.03  # share of a phase that is its wire's end
 AROUND, KICK = 0.01, 0.01  # [s] before and after an impact, and share of the speed by which it is off, that count
 UNIT = np.array([0.04, 0.04, 1.0, 1.0, 1.0])  # of configurations: the objects' radius, about [m], and radians
 PLACES = 1001  # samples a phase
-SORTS = {"pausing": 60, "stopping": 20, "flying": 20}  # and how many of each by default, a seed
+SORTS = {"pausing": 30, "stopping": 10, "flying": 20}  # and how many of each by default, a seed
 UNDECIDED = {Status.AMBIGUOUS, Status.SINGULAR, Status.NO_CONVERGENCE, Status.MAX_STEPS}
 
 
@@ -109,7 +110,8 @@ def predict(scene: wa.Scene, torque: wa.Torque, traced) -> Predicted:
     """Simulate a plan and decide, within `TOLERANCE`, whether it holds."""
     result = wa.simulate(scene, torque, traced=traced)
     courses = [_course(result, phase) for phase in result.phases]
-    states = [_arrives(*pair) for pair in zip(result.phases, courses, strict=True)]
+    last = len(result.phases) - 1
+    states = [_arrives(p, c, k == last) for k, (p, c) in enumerate(zip(result.phases, courses, strict=True))]
     bears = [_bears(phase) for phase in result.phases]
     lasts = [_lasts(*pair) for pair in zip(result.phases, courses, strict=True)]
     # What follows a phase that fails is not what would happen: its forces do not count.
@@ -188,11 +190,11 @@ def _course(result, phase):
     return jax.device_get(sample(phase.traced.table, schedule, outcome.start, outcome.duration, motion, shares))
 
 
-def _arrives(phase, course) -> bool | None:
+def _arrives(phase, course, last: bool) -> bool | None:
     """Whether a phase ends where it should; None where its plan does not say what follows.
 
-    That is so where it comes to its end too early, or where it should have passed on at speed and is late, or stops
-    just short: the model begins the next phase where its wire begins, and the object is not there yet.
+    That is so where it comes to its end too early, and where it stops just short, or is late, and others follow: the
+    model begins the next phase where its wire begins, and the object is not there yet.
     """
     motion = phase.outcome.motion
     ended, length = Status(int(motion.status)), float(phase.traced.table.length)
@@ -203,11 +205,11 @@ def _arrives(phase, course) -> bool | None:
     there = off <= 1
     if _rests(phase):
         return there and phase.status in (Status.OK, Status.CONTACT_LOST)
-    if phase.arrive == "moving":
-        late = off > PASSED
-        if late and (there or ended is Status.OK):
-            return None
-        return not late
+    passes = phase.arrive == "moving"
+    if not last and off > PASSED and (there or (passes and ended is Status.OK)):
+        return None
+    if passes:
+        return off <= PASSED
     if there and (pace > HURRY or share < 1 - EARLY):
         return None
     return there
