@@ -10,7 +10,8 @@ full resolution, compile times (the first call's, nothing kept; compiled quickly
 MuJoCo's rollouts of the same plan with the same scenes on all threads, at the longest of some time steps whose object
 ends within 1 % of its way from the prediction (`pose`), and at the longest whose least force is within 1 % of the
 predicted one, or else the shortest (`margin`; phases are of equal length, and twentieths of a phase at its ends are
-left out, where soft contacts take over).
+left out, where soft contacts take over); and the same with Coulomb's friction (`execution`), at the longest step whose
+least force is.
 """
 
 import argparse
@@ -42,6 +43,7 @@ COMPARED = 8192
 OPTIMISED = 3
 VARIED = {"vertices": 0.0002, "friction": "10%"}
 STEPS = (1.6e-3, 8e-4, 4e-4, 2e-4, 1e-4, 5e-5, 2.5e-5, 1.25e-5)
+FINEST = 5e-5  # [s], of those with Coulomb's friction
 ROLLOUTS = 16
 ARRIVAL = 0.02
 
@@ -203,6 +205,31 @@ def rollouts(ensemble, torque) -> dict:
     return {"threads": os.cpu_count(), "rows": rows, "pose": by_pose, "margin": rows[-1]}
 
 
+def by_coulomb(ensemble, torque) -> dict:
+    """Free bodies with Coulomb's friction on all processors: the rate at the longest step from which margins are right."""
+    from wholearm_jax.execution import clock, execute, motor_torques, start_of
+    from wholearm_jax.free_bodies import free_bodies
+    from wholearm_jax.perturbation import roll_out as driven
+    from wholearm_jax.perturbation import start_near
+
+    prediction = wa.simulate(ensemble.scene, torque)
+    steps = [step for step in STEPS if step >= FINEST]
+    errors = [margin_error(execute(prediction, timestep=step)) for step in steps]
+    longest = max(k for k, error in enumerate(errors) if error > 0.01) + 1
+    wanted, error = steps[longest], errors[longest]
+    begins, step = clock(ensemble.scene, wanted)
+    scenes = [ensemble.draw(np.asarray(number)) for number in range(ROLLOUTS)]
+    starts = [start_near(s, start_of(prediction), np.zeros(3)) for s in scenes]
+    copies = [(free_bodies(s, step), start) for s, start in zip(scenes, starts, strict=True)]
+    torques, workers = motor_torques(torque, begins), os.cpu_count() or 1
+    driven(copies[:workers], torques[:10], workers)  # starts the processes
+    begun = time.perf_counter()
+    driven(copies, torques, workers)
+    rate = ROLLOUTS / (time.perf_counter() - begun)
+    print(f"free bodies at {step:g} s: {rate:.2f} a second, margin {100 * error:.2g} % off", flush=True)
+    return {"timestep": step, "rate": rate, "margin_error": error}
+
+
 def processes(number: int, folder: Path, torque: Path, count: int, chunk: int) -> float:
     """The rate of a store's growth by `number` processes, after each has written its first chunk."""
     out = folder / f"{number}.zarr"
@@ -266,7 +293,7 @@ def draw(found: dict, path: Path) -> None:
     lines = {
         "check and gradient": found["gradient"],
         "MuJoCo, end to 1 %": found["mujoco"]["pose"],
-        "MuJoCo, finest step": found["mujoco"]["margin"],
+        "Coulomb's friction, margin to 1 %": found["coulomb"],
         "optimise": found["optimise"],
     }
     for (name, part), colour in zip(lines.items(), ("#009E73", "#D55E00", "#E69F00", "#CC79A7"), strict=True):
@@ -301,6 +328,7 @@ def main() -> None:
         "scaling": lambda: scaling(ensemble, torque),
         "same_geometry": lambda: same_geometry(torque),
         "mujoco": lambda: rollouts(ensemble, torque),
+        "coulomb": lambda: by_coulomb(ensemble, torque),
         "gradient": lambda: gradients(ensemble, torque),
         "optimise": lambda: optimisations(ensemble),
         "processes": lambda: by_processes(file),
