@@ -206,7 +206,7 @@ def rollouts(ensemble, torque) -> dict:
 
 
 def by_coulomb(ensemble, torque) -> dict:
-    """Free bodies with Coulomb's friction on all processors: the rate at the longest step from which margins are right."""
+    """Free bodies with Coulomb's friction, all processors: the rate at the longest step with right margins."""
     from wholearm_jax.execution import clock, execute, motor_torques, start_of
     from wholearm_jax.free_bodies import free_bodies
     from wholearm_jax.perturbation import roll_out as driven
