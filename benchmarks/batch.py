@@ -163,6 +163,16 @@ def margin_error(done) -> float:
     return float(abs(least["executed"] / least["expected"] - 1))
 
 
+def laid_in(ensemble, torque):
+    """The plan's prediction, and scenes of the ensemble with where each object lies in the hand."""
+    from wholearm_jax.execution import start_of
+    from wholearm_jax.perturbation import start_near
+
+    prediction = wa.simulate(ensemble.scene, torque)
+    scenes = [ensemble.draw(np.asarray(number)) for number in range(ROLLOUTS)]
+    return prediction, scenes, [start_near(s, start_of(prediction), np.zeros(3)) for s in scenes]
+
+
 def roll_out(models, starts, torques) -> None:
     """Drive models from rest at their starts, on all threads."""
     import mujoco
@@ -177,23 +187,20 @@ def roll_out(models, starts, torques) -> None:
 
 def rollouts(ensemble, torque) -> dict:
     """MuJoCo, its own friction, all threads: rates at the longest time step that still ends near the prediction."""
-    from wholearm_jax.execution import clock, execute, motor_torques, start_of
+    from wholearm_jax.execution import clock, execute, motor_torques
     from wholearm_jax.free_bodies import CONVEX, free_bodies
-    from wholearm_jax.perturbation import start_near
 
-    prediction = wa.simulate(ensemble.scene, torque)
+    prediction, scenes, starts = laid_in(ensemble, torque)
     course = np.concatenate([np.asarray(t.z) for t in wa.trajectory(prediction)])
     moved = np.abs(np.diff(course, axis=0))
     way, turn = np.hypot(moved[:, 0], moved[:, 1]).sum(), moved[:, 2].sum()
-    scenes = [ensemble.draw(np.asarray(number)) for number in range(ROLLOUTS)]
-    starts = np.stack([start_near(s, start_of(prediction), np.zeros(3)) for s in scenes])
     rows = []
     for wanted in STEPS:
         done = execute(prediction, timestep=wanted, softness=CONVEX)
         begins, step = clock(ensemble.scene, wanted)
         models = [free_bodies(s, step, CONVEX).model for s in scenes]
         begun = time.perf_counter()
-        roll_out(models, starts, motor_torques(torque, begins))
+        roll_out(models, np.stack(starts), motor_torques(torque, begins))
         rate = ROLLOUTS / (time.perf_counter() - begun)
         pose = max(done.position_error / way, abs(done.angle_error) / turn)
         rows.append({"timestep": step, "rate": rate, "pose_error": float(pose), "margin_error": margin_error(done)})
@@ -207,19 +214,16 @@ def rollouts(ensemble, torque) -> dict:
 
 def by_coulomb(ensemble, torque) -> dict:
     """Free bodies with Coulomb's friction, all processors: the rate at the longest step with right margins."""
-    from wholearm_jax.execution import clock, execute, motor_torques, start_of
+    from wholearm_jax.execution import clock, execute, motor_torques
     from wholearm_jax.free_bodies import free_bodies
     from wholearm_jax.perturbation import roll_out as driven
-    from wholearm_jax.perturbation import start_near
 
-    prediction = wa.simulate(ensemble.scene, torque)
+    prediction, scenes, starts = laid_in(ensemble, torque)
     steps = [step for step in STEPS if step >= FINEST]
     errors = [margin_error(execute(prediction, timestep=step)) for step in steps]
-    longest = max(k for k, error in enumerate(errors) if error > 0.01) + 1
+    longest = max((k for k, error in enumerate(errors) if error > 0.01), default=-1) + 1
     wanted, error = steps[longest], errors[longest]
     begins, step = clock(ensemble.scene, wanted)
-    scenes = [ensemble.draw(np.asarray(number)) for number in range(ROLLOUTS)]
-    starts = [start_near(s, start_of(prediction), np.zeros(3)) for s in scenes]
     copies = [(free_bodies(s, step), start) for s, start in zip(scenes, starts, strict=True)]
     torques, workers = motor_torques(torque, begins), os.cpu_count() or 1
     driven(copies[:workers], torques[:10], workers)  # starts the processes

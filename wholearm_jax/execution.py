@@ -145,7 +145,7 @@ def execute(
     bodies = free_bodies(scene, step, softness)
     course, creep = drive(bodies, scene, start_of(prediction), motor_torques(prediction.torque, times), step)
     expected, target = _expected(prediction, bodies.names), target_of(prediction)
-    ending, lost = judge(scene, course.z[-1], target, tolerance)
+    ending, lost = judge(scene, course.z[-1], target, tolerance, creep)
     return Execution(
         prediction=prediction,
         course=course,
@@ -153,7 +153,7 @@ def execute(
         names=bodies.names,
         target=target,
         tolerance=tolerance,
-        ending=ending if creep <= tolerance.position else Ending.DIVERGED,
+        ending=ending,
         creep=creep,
         open_at_end=lost,
         events=_events(bodies.names, expected, course),
@@ -199,9 +199,16 @@ def target_of(prediction: Result) -> Float[np.ndarray, "5"]:
 
 
 def drive(bodies: FreeBodies, scene: Scene, start, torques, timestep: float) -> tuple[Course, float]:
-    """Step the model from rest at `start`; row `k` of the course is the state before step `k`.
+    """The course of `follow`, and how far contacts crept."""
+    z, z_dot, forces, creep = follow(bodies, start, torques)
+    times = np.arange(len(z)) * timestep
+    return Course(times, z, z_dot, forces[..., 0], forces[..., 1], touching(scene, bodies.names, z)), creep
 
-    The second is how far contacts slipped against Coulomb's law in all steps together, at most [m]; infinite where
+
+def follow(bodies: FreeBodies, start, torques):
+    """Step the model from rest at `start`: `z`, `z_dot` and forces `(c_n, c_t)`; row `k` is the state before step `k`.
+
+    The last is how far contacts slipped against Coulomb's law in all steps together, at most [m]; infinite where
     MuJoCo gave up.
     """
     data, step = mujoco.MjData(bodies.model), stepper(bodies)
@@ -212,12 +219,11 @@ def drive(bodies: FreeBodies, scene: Scene, start, torques, timestep: float) -> 
     for k, torque in enumerate(torques):
         z[k], z_dot[k] = data.qpos, data.qvel
         found, wrong = step(bodies, data, torque, found)
-        forces[k], creep = found, creep + wrong * timestep
+        forces[k], creep = found, creep + wrong * bodies.model.opt.timestep
     z[count], z_dot[count] = data.qpos, data.qvel
     forces[count], _ = step(bodies, data, torques[-1], found)  # beyond the end, for the forces there
-    times = np.arange(count + 1) * timestep
-    course = Course(times, z, z_dot, forces[..., 0], forces[..., 1], touching(scene, bodies.names, z))
-    return course, np.inf if gave_up(data) else creep
+    gave_up = any(warning.number for warning in data.warning)
+    return z, z_dot, forces, np.inf if gave_up else creep
 
 
 def stepper(bodies: FreeBodies) -> Callable:
@@ -231,11 +237,6 @@ def _advance(bodies: FreeBodies, data: mujoco.MjData, torque, before):
     forces = np.zeros_like(before)
     _read_forces(bodies, data, forces)
     return forces, 0.0
-
-
-def gave_up(data: mujoco.MjData) -> bool:
-    """Whether MuJoCo found numbers that are none, or too large."""
-    return any(warning.number for warning in data.warning)
 
 
 def _read_forces(bodies: FreeBodies, data: mujoco.MjData, into) -> None:
@@ -271,13 +272,15 @@ def _touching(solid: Body, hand: Hand, pairs: Formation, z, slack):
     return (jnp.abs(at.gap) < slack) & on_feature  # far behind an edge's line the gap is negative, and nothing touches
 
 
-def judge(scene: Scene, z, target, tolerance: Tolerance) -> tuple[Ending, tuple[str, ...]]:
-    """What became of an execution that ended at `z`, and which contacts of the last phase are open."""
+def judge(scene: Scene, z, target, tolerance: Tolerance, creep: float = 0.0) -> tuple[Ending, tuple[str, ...]]:
+    """What became of an execution that ended at `z` and crept so far, and which contacts of the last phase are open."""
     names = tuple(map(pair_name, scene.phases[-1].formation.names))
     closed = touching(scene, names, z[None], tolerance.position)[0]
     lost = tuple(name for name, there in zip(names, closed, strict=True) if not there)
     off = np.abs(z - target)
     near = np.hypot(*off[:2]) <= tolerance.position and off[2] <= tolerance.angle
+    if not creep <= tolerance.position:
+        return Ending.DIVERGED, lost
     return (Ending.CONTACT_LOST if lost else Ending.OK if near else Ending.ASTRAY), lost
 
 

@@ -45,7 +45,7 @@ def execute(
         from wholearm_jax.perturbation import Amounts, require_objects
         from wholearm_jax.perturbation import perturb as drive_perturbed
     except ModuleNotFoundError as error:
-        if error.name != "mujoco":
+        if error.name not in ("mujoco", "joblib"):
             raise
         raise BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
     from wholearm_jax.result_file import read_torque

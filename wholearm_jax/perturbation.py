@@ -18,7 +18,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 from joblib import Parallel, delayed
@@ -28,12 +27,11 @@ from wholearm_jax.execution import (
     Ending,
     Tolerance,
     clock,
-    gave_up,
+    follow,
     judge,
     motor_torques,
     require_wires,
     start_of,
-    stepper,
     target_of,
 )
 from wholearm_jax.free_bodies import FreeBodies, Softness, free_bodies
@@ -124,7 +122,7 @@ def perturb(
     found = roll_out(copies(), torques, min(workers or os.cpu_count() or 1, count))
     runs = []
     for scene, (end, creep) in zip(scenes, found, strict=True):
-        ending = judge(scene, end, target, tolerance)[0] if creep <= tolerance.position else Ending.DIVERGED
+        ending, _ = judge(scene, end, target, tolerance, creep)
         runs.append(_summary(prediction.scene, scene, end, target, ending))
     return Robustness(amounts, seed, tolerance, tuple(runs))
 
@@ -175,19 +173,14 @@ def _touch_down(shape, hand, gravity, formation: Formation, z, shift) -> Float[A
 def roll_out(
     copies: Iterable[tuple[FreeBodies, Float[np.ndarray, "5"]]], torques, workers: int
 ) -> list[tuple[Float[np.ndarray, "5"], float]]:
-    """Where free bodies end, driven from rest at their starts, and how far their contacts crept (`execution.drive`)."""
+    """Where free bodies end, driven from rest at their starts, and how far contacts crept (`execution.follow`)."""
     each = (delayed(_end)(bodies, start, torques) for bodies, start in copies)
     return list(Parallel(n_jobs=workers)(each))  # pyright: ignore[reportReturnType]
 
 
 def _end(bodies: FreeBodies, start, torques) -> tuple[Float[np.ndarray, "5"], float]:
-    data, step = mujoco.MjData(bodies.model), stepper(bodies)
-    data.qpos[:] = start
-    forces, creep = np.zeros((len(bodies.names), 2)), 0.0
-    for torque in torques:
-        forces, wrong = step(bodies, data, torque, forces)
-        creep += wrong * bodies.model.opt.timestep
-    return np.array(data.qpos), np.inf if gave_up(data) else creep
+    z, _, _, creep = follow(bodies, start, torques)
+    return z[-1], creep
 
 
 def _summary(scene: Scene, changed: Scene, end, target, ending: Ending) -> Perturbed:

@@ -138,11 +138,7 @@ def execution_summary(execution: Execution, robustness: Robustness | None = None
     within = {"tolerance": execution.tolerance._asdict(), "open_at_end": list(execution.open_at_end)}
     events = [event._asdict() for event in execution.events]
     prediction = {"status": execution.prediction.status.label, "margin": execution.prediction.margin}
-    row = (
-        _plain(head | errors | {"creep": execution.creep})
-        | within
-        | {"events": events, "prediction": _plain(prediction)}
-    )
+    row = _plain(head | errors) | within | {"events": events, "prediction": _plain(prediction)}
     if robustness is not None:
         low, high = robustness.interval
         row["perturbed"] = {
