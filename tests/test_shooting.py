@@ -20,6 +20,11 @@ from wholearm_jax.stepping import Integration
 HOW = Integration()
 
 
+def _shot(table, intervals, q):
+    """One interval."""
+    return jax.tree.map(lambda a: a[0], shoot(table, HOW, intervals, q[None]))
+
+
 @pytest.fixture(scope="module")
 def flip():
     """The heptagon's flip, whose wire has a slip reversal near its end."""
@@ -37,7 +42,7 @@ def _moving(table):
 def test_an_interval_crosses_a_reversal_as_the_simulation_does(flip):
     q, reversal = _moving(flip)
     intervals = 300
-    shot = shoot(flip, HOW, intervals, q)
+    shot = _shot(flip, intervals, q)
     assert float(shot.end[0]) > reversal, "the interval must cross the reversal"
     assert (np.asarray(shot.weight) > 0).sum() == 20, "two parts of two steps with five samples"
     values = q[2:6].reshape(2, 2) * flip.torque_limit
@@ -56,7 +61,7 @@ def test_paces_bound_the_speed_between_knots(flip):
     s, v = flip.breaks[0] + 0.3 * flip.length, speed * flip.length
     torque = [squeeze.hold(flip, s, v, a).torque / flip.torque_limit for a in (-brake, brake)]
     q = jnp.concatenate([jnp.array([0.3, speed]), *torque, jnp.zeros(1)])
-    shot = shoot(flip, HOW, intervals, q)
+    shot = _shot(flip, intervals, q)
     seen = window(wa.torque([0.0, 1 / intervals], q[2:6].reshape(2, 2) * flip.torque_limit), 0.0, 1 / intervals)
     motion = move(flip, seen, jnp.asarray(1 / intervals), how=Integration(tolerance=1e-12), s=s, speed=v, free=True)
     steps = arcs(flip, seen, 1 / intervals, motion)
@@ -74,7 +79,7 @@ def test_derivatives_of_an_interval_that_is_cut(flip):
     q, _ = _moving(flip)
 
     def everything(q):
-        shot = shoot(flip, HOW, 300, q)
+        shot = _shot(flip, 300, q)
         return jnp.concatenate([shot.forces.ravel(), shot.pace, shot.end])
 
     exact = jax.jacfwd(everything)(q)
@@ -99,7 +104,7 @@ def test_joined_intervals_are_the_phase():
     assert np.abs(shares[at] - np.arange(knots) / (knots - 1)).max() < 1e-9, "steps end on the knots"
     state = np.stack([(motion.s[np.array(at)] - table.breaks[0]), motion.w[np.array(at)]], axis=1) / float(table.length)
     p = Variables((found.torque.values / table.torque_limit)[None], jnp.asarray(state)[None], jnp.zeros(1))
-    ends = jax.vmap(lambda q: shoot(table, HOW, knots - 1, q).end)(local(p)[0])
+    ends = shoot(table, HOW, knots - 1, local(p)[0]).end
     np.testing.assert_allclose(ends, state[1:], atol=1e-8)
 
 

@@ -79,7 +79,7 @@ def test_repeated_steps_are_those_found_and_have_derivatives(adjoint):
         np.testing.assert_allclose(jax.jacrev(end)(y), MATRIX, atol=1e-11)
 
 
-def spring_of(stiffness):
+def spring_of(stiffness, seen):
     return lambda share, y, row: jnp.stack([y[1], -stiffness * y[0]])
 
 

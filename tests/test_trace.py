@@ -12,7 +12,7 @@ import wholearm_jax as wa
 from wholearm_jax.contacts import gaps, normal_rows, slip_rows
 from wholearm_jax.newton import newton
 from wholearm_jax.phase import end_configuration, ending
-from wholearm_jax.reduction import on_panel, powers
+from wholearm_jax.reduction import combined, on_panel, powers
 from wholearm_jax.scene import body
 from wholearm_jax.scene_file import to_dict
 from wholearm_jax.system import system
@@ -193,3 +193,24 @@ def test_a_vertex_leaves_the_palm_where_it_ends(toward, contact, x):
     assert ending(traced, scene.phases[0], 8) == f"{contact} leaves its feature"
     z = np.asarray(end_configuration(traced))
     np.testing.assert_allclose(z[:3], [x, 0.03, 0.0], atol=1e-12)
+
+
+def test_combined_functions_have_the_derivatives_of_a_sum_of_products():
+    """In every argument, in both modes, once and twice; the sum is written out here."""
+    rng = np.random.default_rng(2)
+    coefficients, terms, panel = rng.normal(size=(3, 8, 4, 5)), rng.normal(size=5), jnp.asarray(1)
+
+    def plain(coefficients, xi, terms):
+        return (coefficients[panel] * xi ** jnp.arange(8)[:, None, None]).sum(0) @ terms
+
+    def ours(coefficients, xi, terms):
+        return combined(coefficients, panel, xi, terms)
+
+    given = jnp.asarray(coefficients), jnp.asarray(0.3), jnp.asarray(terms)
+    np.testing.assert_allclose(ours(*given), plain(*given), rtol=1e-13)
+    for mode in (jax.jacfwd, jax.jacrev):
+        for exact, found in zip(mode(plain, (0, 1, 2))(*given), mode(ours, (0, 1, 2))(*given), strict=True):
+            np.testing.assert_allclose(found, exact, rtol=1e-12, atol=1e-14)
+    twice = [jax.jacfwd(jax.jacrev(f, (1, 2)), (1, 2))(*given) for f in (plain, ours)]
+    for exact, found in zip(*map(jax.tree.leaves, twice), strict=True):
+        np.testing.assert_allclose(found, exact, rtol=1e-12, atol=1e-14)

@@ -26,13 +26,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from wholearm_jax.condensing import following, free, newton_step, of_states, order, together
 from wholearm_jax.forces import smooth_margin
-from wholearm_jax.linearisation import Limits, Linear, change_of_rooms, gather, linearise, metric
+from wholearm_jax.linearisation import Limits, Linear, change_of_rooms, gather, linearise, sizes
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Table
 from wholearm_jax.shooting import PACES, PARTS, ROWS, SAMPLES, STEPS, Variables
@@ -88,7 +88,7 @@ def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
         stiff = price / slack
         miss = given - slack
         aim = jnp.where(live, target - stiff * miss, 0.0)
-        way, rise, forces = _solve(linear, stiff, aim, damping)
+        way, rise, joining = newton_step(linear, stiff, aim, damping)
         dslack = change_of_rooms(linear, way) - bears * rise + miss
         dslack = jnp.where(live, dslack, 0.0)
         dprice = jnp.where(live, target - price - stiff * dslack, 0.0)
@@ -105,28 +105,11 @@ def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
             jnp.clip(hot * cooling, coldest, HOTTEST),
             coldest,
             jnp.stack([primal, dual]),
-            jnp.abs(forces).max(),
+            jnp.abs(joining).max(),
         )
         return primal * way, state
 
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
-
-
-def _solve(linear: Linear, stiff, aim, damping):
-    """The step of `p` and of the margin's level, and the prices of joining the intervals: one symmetric system.
-
-    `damping` is a price of the step's size: it keeps steps small along ways that the loss hardly sees.
-    """
-    bears, across = linear.bears, jnp.where(linear.still, 0.0, linear.across)
-    e, n = across.shape
-    lean = gather(linear, stiff * bears)
-    matrix = jnp.zeros((n + 1 + e, n + 1 + e))
-    matrix = matrix.at[:n, :n].set(metric(linear, stiff) + damping * jnp.eye(n)).at[n, n].set((stiff * bears).sum())
-    matrix = matrix.at[:n, n].set(-lean).at[n, :n].set(-lean)
-    matrix = matrix.at[:n, n + 1 :].set(across.T).at[n + 1 :, :n].set(across)
-    right = [gather(linear, aim), (1 - (bears * aim).sum())[None], -linear.defect]
-    step = jnp.linalg.solve(matrix, jnp.concatenate(right))
-    return step[:n], step[n], step[n + 1 :]
 
 
 def _reach(value, change):
@@ -141,24 +124,6 @@ def _cap(linear: Linear, way):
     size = 2 * phases * (intervals + 1)
     change = jnp.abs(way[size : 2 * size].reshape(-1, 2)).max(0)
     return (jnp.array(LONGEST) / jnp.maximum(change, 1e-30)).min()
-
-
-def _follow(linear: Linear):
-    """How the states follow the torques and durations where intervals and phases join.
-
-    Returns the places of torques and durations and of the states that follow in the flattened variables,
-    `follow` and `apart` with `states' change = follow @ change + apart`, and which of the states must not change.
-    """
-    phases, intervals = linear.at.room.shape[:2]
-    size = 2 * phases * (intervals + 1)
-    free = np.append(np.arange(size), np.arange(2 * size, 2 * size + phases))
-    place = np.arange(size, 2 * size).reshape(phases, intervals + 1, 2)
-    goals = np.append(place[:, -1, 0], place[-1, -1, 1])
-    states = np.setdiff1d(place, np.append(place[:, 0, 0], place[0, 0, 1]))
-    rows = np.arange(2 * phases * intervals + phases - 1)
-    right = jnp.column_stack([linear.across[rows][:, free], linear.defect[rows]])
-    solved = jnp.linalg.solve(linear.across[rows][:, states], right)
-    return free, states, -solved[:, :-1], -solved[:, -1], np.isin(states, goals)
 
 
 class Cooling(NamedTuple):
@@ -188,16 +153,19 @@ def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) ->
         above = at.room - linear.bears * level
         # Outside a limit the loss is infinite: there the pull back to it is that of a small room.
         pull = gather(linear, hot * at.weight / jnp.maximum(above, hot))
-        free, states, follow, apart, goal = _follow(linear)
-        last = follow[goal]
+        at_knots, follow = order(*sizes(linear)), following(linear)
+        last = follow.matrix[at_knots.goals]
 
         def arriving(step, rest):
             return step - last.T @ jnp.linalg.solve(last @ last.T, last @ step + rest)
 
-        gradient = arriving(-pull[free] - follow[~goal].T @ pull[states[~goal]], 0.0)
-        updates, inner = optimiser.update(jnp.zeros_like(pull).at[free].set(gradient), state.inner, params, **extra)
-        step = arriving(jnp.where(linear.still, 0.0, jnp.asarray(updates))[free], apart[goal])
-        way = jnp.zeros_like(pull).at[free].set(step).at[states[~goal]].set((follow @ step + apart)[~goal])
+        gradient = arriving(-free(pull, at_knots) - of_states(pull, at_knots) @ follow.matrix, 0.0)
+        whole = together(linear, gradient, jnp.zeros_like(follow.apart))
+        updates, inner = optimiser.update(whole, state.inner, params, **extra)
+        step = arriving(
+            free(jnp.where(linear.still, 0.0, jnp.asarray(updates)), at_knots), follow.apart[at_knots.goals]
+        )
+        way = together(linear, step, follow.matrix @ step + follow.apart)
         change = change_of_rooms(linear, way)
         within = (at.weight > 0) & (linear.bears == 0) & (at.room > 0)
         reach = _reach(jnp.where(within, at.room, 1.0), jnp.where(within, change, 0.0))

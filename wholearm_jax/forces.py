@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from wholearm_jax.landing import acceleration, single_step
 from wholearm_jax.lookup import pick
 from wholearm_jax.motion import Motion
-from wholearm_jax.reduction import Table, on_panel, polynomial, powers
+from wholearm_jax.reduction import Table, combined, polynomial, powers
 from wholearm_jax.schedule import Window, torque_in
 from wholearm_jax.stepping import Integration
 
@@ -105,10 +105,9 @@ def on_arc(one: Arcs, xi: Float[Array, ""]):
 def force(table: Table, seen: Window, duration, piece, row, share, s, w) -> Float[Array, "slots"]:
     """Constraint forces [N] for forward travel: `c_n`, and `c_t` in tangential rows."""
     panel, xi = powers(table, piece, s)
-    terms = on_panel(table.force, panel, xi)
     v = w / duration
-    one = jnp.ones_like(v)
-    return terms @ jnp.concatenate([jnp.stack([one, v**2, v]), torque_in(seen, row, share)])
+    rest = jnp.stack([jnp.ones_like(v), v**2, v])
+    return combined(table.force, panel, xi, jnp.concatenate([rest, torque_in(seen, row, share)]))
 
 
 def slack(table: Table, forces: Float[Array, "slots"]) -> Float[Array, "slots"]:

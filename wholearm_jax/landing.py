@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from wholearm_jax.precision import digits
-from wholearm_jax.reduction import Table, on_panel, powers
+from wholearm_jax.reduction import Table, combined, powers
 from wholearm_jax.schedule import Window, torque_in
 from wholearm_jax.stepping import Integration, solver_of
 
@@ -20,9 +20,9 @@ LANDINGS = 40  # at most so many Newton steps, or halvings, to the place where a
 def acceleration(table: Table, seen: Window, duration, piece, row, share, s, w):
     """`dw/du` for forward travel in a piece and a torque interval."""
     panel, xi = powers(table, piece, s)
-    a = on_panel(table.acceleration, panel, xi)
-    tau = torque_in(seen, row, share)
-    return duration**2 * (a[0] + a[3] * tau[0] + a[4] * tau[1]) + duration * a[2] * w + a[1] * w**2
+    rest = jnp.stack([duration**2, w**2, duration * w])
+    terms = jnp.concatenate([rest, duration**2 * torque_in(seen, row, share)])
+    return combined(table.acceleration, panel, xi, terms)
 
 
 @jax.jit

@@ -3,6 +3,7 @@
 Derivation: section 9 of `docs/derivation.md`.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.forces import spare
 from wholearm_jax.reduction import Table, change, on_panel, powers
-from wholearm_jax.shooting import PARTS, ROWS, SAMPLES, STEPS, Variables, local, shoot
+from wholearm_jax.shooting import PARTS, ROWS, SAMPLES, STEPS, Shot, Variables, local, shoot
 from wholearm_jax.stepping import Integration
 
 
@@ -57,10 +58,18 @@ class Linear(NamedTuple):
     still: Bool[Array, "p"]
 
 
-def rooms(q: Float[Array, "7"], slowest, table: Table, limits: Limits, how, intervals: int) -> Rooms:
+def rooms(q: Float[Array, "phases intervals 7"], tables: Table, limits: Limits, how: Integration) -> Rooms:
+    """All intervals of phases that follow one another at speed."""
+    phases, intervals = q.shape[:2]
+    slowest = jnp.zeros((phases, intervals)).at[:, 0].set(limits.passing).at[0, 0].set(-jnp.inf)
+    each = jax.vmap(jax.vmap(partial(_rooms, intervals), (0, 0, 0, None, None)), (0, 0, 0, 0, OF_PHASES))
+    shots = jax.vmap(lambda table, q: shoot(table, how, intervals, q))(tables, q)
+    return each(q, shots, slowest, tables, limits)
+
+
+def _rooms(intervals: int, q: Float[Array, "7"], shot: Shot, slowest, table: Table, limits: Limits) -> Rooms:
     """One interval; `slowest` is the least speed with which it may begin, and -inf where it starts at rest; `limits`
     are those of its phase."""
-    shot = shoot(table, how, intervals, q)
     torque, log = q[2:6], q[6]
     bounded = jnp.isfinite(limits.rate)
     step = jnp.where(bounded, limits.rate, 1.0) / table.torque_limit * jnp.exp(log) / intervals
@@ -81,16 +90,15 @@ def rooms(q: Float[Array, "7"], slowest, table: Table, limits: Limits, how, inte
 
 
 def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> Linear:
-    """Simulate all intervals, with first derivatives by forward mode."""
+    """Simulate all intervals, with first derivatives by forward mode: all depend on numbers of their own, so that
+    seven directions serve them all."""
     phases, knots = p.torque.shape[:2]
+    q = local(p)
 
-    def both(q, slowest, table, limits):
-        at = rooms(q, slowest, table, limits, how, knots - 1)
-        return at, at
+    def along(way):
+        return jax.jvp(lambda q: rooms(q, tables, limits, how), (q,), (jnp.broadcast_to(way, q.shape),))
 
-    each = jax.vmap(jax.vmap(jax.jacfwd(both, has_aux=True), (0, 0, None, None)), (0, 0, 0, OF_PHASES))
-    slowest = jnp.zeros((phases, knots - 1)).at[:, 0].set(limits.passing).at[0, 0].set(-jnp.inf)
-    rates, at = each(local(p), slowest, tables, limits)
+    at, rates = jax.vmap(along, out_axes=(None, -1))(jnp.eye(7))
     columns, ends = _columns(phases, knots)
     row = np.arange(ends.size)
     n = 4 * phases * knots + phases
@@ -155,26 +163,32 @@ def _still(limits: Limits, phases: int, knots: int) -> Bool[Array, "p"]:
     return jnp.concatenate([jnp.repeat(limits.pinned.ravel(), 2), jnp.asarray(ends.ravel()), fixed])
 
 
+def sizes(linear: Linear) -> tuple[int, int]:
+    """Phases and knots."""
+    phases, intervals = linear.at.room.shape[:2]
+    return phases, intervals + 1
+
+
+def columns(linear: Linear) -> Int[np.ndarray, "phases intervals 7"]:
+    """Where in the flattened `Variables` each interval's seven numbers stand."""
+    return _columns(*sizes(linear))[0]
+
+
+def scattered(linear: Linear, values: Float[Array, "phases intervals 7"]) -> Float[Array, "p"]:
+    """Numbers of each interval's own seven variables, summed for each variable; zero for those that stay."""
+    return jnp.where(linear.still, 0.0, jnp.zeros(linear.still.shape[0]).at[columns(linear)].add(values))
+
+
 def gather(linear: Linear, values: Float[Array, "phases intervals rooms"]) -> Float[Array, "p"]:
     """`J^T values`, with `J` the derivatives of all rooms."""
-    phases, intervals = values.shape[:2]
-    columns, _ = _columns(phases, intervals + 1)
-    pull = jnp.zeros(linear.still.shape[0]).at[columns].add(jnp.einsum("pkr,pkrq->pkq", values, linear.rates.room))
-    return jnp.where(linear.still, 0.0, pull)
+    return scattered(linear, jnp.einsum("pkr,pkrq->pkq", values, linear.rates.room))
 
 
-def metric(linear: Linear, values: Float[Array, "phases intervals rooms"]) -> Float[Array, "p p"]:
-    """`J^T diag(values) J`, the identity for variables that stay."""
-    phases, intervals = values.shape[:2]
-    still, n = linear.still, linear.still.shape[0]
-    columns, _ = _columns(phases, intervals + 1)
-    blocks = jnp.einsum("pkr,pkrq,pkrs->pkqs", values, linear.rates.room, linear.rates.room)
-    metric = jnp.zeros((n, n)).at[columns[..., :, None], columns[..., None, :]].add(blocks)
-    return jnp.where(still[:, None] | still, 0.0, metric) + jnp.diag(jnp.where(still, 1.0, 1e-8))
+def blocks(linear: Linear, values: Float[Array, "phases intervals rooms"]) -> Float[Array, "phases intervals 7 7"]:
+    """`J^T diag(values) J` for each interval's own seven variables."""
+    return jnp.einsum("pkr,pkrq,pkrs->pkqs", values, linear.rates.room, linear.rates.room)
 
 
 def change_of_rooms(linear: Linear, way: Float[Array, "p"]) -> Float[Array, "phases intervals rooms"]:
     """`J way`."""
-    phases, intervals = linear.at.room.shape[:2]
-    columns, _ = _columns(phases, intervals + 1)
-    return jnp.einsum("pkrq,pkq->pkr", linear.rates.room, way[columns])
+    return jnp.einsum("pkrq,pkq->pkr", linear.rates.room, way[columns(linear)])

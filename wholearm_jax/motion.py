@@ -222,13 +222,13 @@ def _integrate(table, seen, duration, how, state, final, goal, floor) -> Steps:
     """Steps from the state to `final` or to the first that passes `goal` or falls below the speed `floor`."""
     limits, final = stop_gradient(((goal, floor), final))
     way = limits[0] - stop_gradient(state.s)
-    parameters = table, seen, duration, state.piece
+    parameters = table, duration, state.piece
     begin, y = state.share, jnp.stack([state.s, state.w])
     if how.adjoint == "reverse":
         return reversible((parameters, seen, begin, y), _field, _past, how, final, limits, way)
 
     def solve(method, parameters, seen, begin, y, *more):
-        return method(_field(parameters), seen, how, begin, final, y, *more)
+        return method(_field(parameters, seen), seen, how, begin, final, y, *more)
 
     inputs = parameters, seen, begin, y
     fixed = inputs if how.adjoint == "none" else stop_gradient(inputs)
@@ -236,9 +236,9 @@ def _integrate(table, seen, duration, how, state, final, goal, floor) -> Steps:
     return steps if how.adjoint == "none" else solve(repeated, *inputs, steps)
 
 
-def _field(parameters):
+def _field(parameters, seen: Window):
     """`d(s, w)/du` in a piece, for `stepping`."""
-    table, seen, duration, piece = parameters
+    table, duration, piece = parameters
 
     def field(u, y, row):
         return jnp.stack([y[1], acceleration(table, seen, duration, piece, row, u, y[0], y[1])])

@@ -223,6 +223,38 @@ def on_panel(coefficients: Float[Array, "panels powers ..."], panel: Int[Array, 
     return polynomial(pick(coefficients, panel), xi)
 
 
+def combined(
+    coefficients: Float[Array, "panels powers *slots terms"], panel: Int[Array, ""], xi, terms: Float[Array, "terms"]
+) -> Float[Array, "*slots"]:
+    """The sum of one of a table's functions times `terms`, at the place that `powers` tells."""
+    return _combined(pick(coefficients, panel), xi, terms)
+
+
+@jax.custom_jvp
+def _combined(coefficients, xi, terms):
+    return polynomial(coefficients, xi) @ terms
+
+
+def _change_of_combined(primals, tangents):
+    """The slope in `xi` is summed before it is multiplied by the many directions there may be."""
+    coefficients, xi, terms = primals
+    zero = jax.custom_derivatives.SymbolicZero
+    change, rate, turn = (None if isinstance(tangent, zero) else tangent for tangent in tangents)
+    values = polynomial(coefficients, xi)
+    total = jnp.zeros(values.shape[:-1], values.dtype)
+    if turn is not None:
+        total = values @ turn
+    if rate is not None:
+        power = jnp.arange(1.0, coefficients.shape[0], dtype=values.dtype).reshape(-1, *(1,) * values.ndim)
+        total = total + polynomial(coefficients[1:] * power, xi) @ terms * rate
+    if change is not None:
+        total = total + polynomial(change, xi) @ terms
+    return values @ terms, total
+
+
+_combined.defjvp(_change_of_combined, symbolic_zeros=True)
+
+
 def _tail(values):
     """The last two Chebyshev coefficients of every panel against the largest value of each function.
 

@@ -17,6 +17,7 @@ Derivation: section 9 of `docs/derivation.md`.
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -28,6 +29,7 @@ from jaxtyping import Array, Float, Int
 
 from wholearm_jax.forces import MOST_ROLLING, Arcs, arc, linear_slacks, sampled_slacks
 from wholearm_jax.landing import acceleration, single_step
+from wholearm_jax.lookup import pick
 from wholearm_jax.reduction import Table
 from wholearm_jax.schedule import Window
 from wholearm_jax.stepping import Integration
@@ -69,67 +71,90 @@ def local(p: Variables) -> Float[Array, "phases intervals 7"]:
     return jnp.concatenate([p.state[:, :-1], p.torque[:, :-1], p.torque[:, 1:], spread], axis=2)
 
 
-class _Parts(NamedTuple):
-    """An interval on its way: where it has come to, and the steps of its parts so far, one part a piece of the wire."""
+class _Way(NamedTuple):
+    """An interval on its way: where it has come to, through so many parts, one in each piece of the wire."""
 
-    share: Float[Array, ""]
-    y: Float[Array, "2"]
-    piece: Int[Array, ""]
-    count: Int[Array, ""]
-    when: Float[Array, "parts nodes"]
-    place: Float[Array, "parts nodes 2"]
-    pieces: Int[Array, "parts"]
+    share: Float[Array, "*intervals"]
+    y: Float[Array, "*intervals 2"]
+    piece: Int[Array, "*intervals"]
+    count: Int[Array, "*intervals"]
 
 
-def shoot(table: Table, how: Integration, intervals: int, q: Float[Array, "7"]) -> Shot:
-    """Simulate one interval of a phase of `intervals`.
+class _Samples(NamedTuple):
+    """Forces, speeds, and their shares of the phase, as in `Shot`."""
+
+    forces: Float[Array, "samples rows"]
+    weight: Float[Array, "samples"]
+    pace: Float[Array, "paces"]
+    pace_weight: Float[Array, "paces"]
+
+
+def shoot(table: Table, how: Integration, intervals: int, q: Float[Array, "cut 7"]) -> Shot:
+    """Simulate intervals of a phase, which as a whole has `intervals`.
 
     An interval that touches more than `PARTS` pieces, or whose cut is not found, ends in NaN.
     """
-    duration = jnp.exp(q[6]) / intervals
-    values = q[2:6].reshape(2, 2) * table.torque_limit
-    zero = jnp.zeros((), int)
-    seen = Window(jnp.arange(2.0), values, values[1:] - values[:-1], zero, zero)
-    per_interval = table.length / intervals
-    y = jnp.stack([table.breaks[0] + table.length * q[0], per_interval * q[1]])
+    cut = q.shape[0]
+    part = partial(_one_part, table, how, intervals)
+    begin = jax.vmap(lambda q: _set_out(table, intervals, q))(q)
+    first, samples = jax.vmap(part)(begin, q)
+    all_parts = jax.tree.map(lambda a: jnp.zeros((cut, PARTS, *a.shape[1:]), a.dtype).at[:, 0].set(a), samples)
+
+    def waiting(at: _Way):
+        return (at.share < 1) & (at.count < PARTS)
+
+    def next_part(state):
+        """Most intervals have one part: the others go on one at a time."""
+        at, all_parts = state
+        k = jnp.argmax(waiting(at))
+        one = jax.tree.map(lambda a: pick(a, k), at)
+        after, samples = part(one, pick(q, k))
+        at = jax.tree.map(lambda all, one: all.at[k].set(one), at, after)
+        return at, jax.tree.map(lambda all, new: all.at[k, one.count].set(new), all_parts, samples)
+
+    done, all_parts = jax.lax.while_loop(lambda state: jnp.any(waiting(state[0])), next_part, (first, all_parts))
+    joined = jax.tree.map(lambda a: a.reshape(cut, -1, *a.shape[3:]), all_parts)
+    y = jnp.where((done.share < 1)[:, None], jnp.nan, done.y)
+    end = jnp.stack([y[:, 0] - table.breaks[0], y[:, 1] * intervals], axis=1) / table.length
+    return Shot(**joined._asdict(), end=end)
+
+
+def _set_out(table: Table, intervals: int, q: Float[Array, "7"]) -> _Way:
+    """Where an interval begins."""
+    y = jnp.stack([table.breaks[0] + table.length * q[0], table.length / intervals * q[1]])
     real = jnp.arange(table.breaks.shape[0]) < table.count
     piece = jnp.maximum(((stop_gradient(y[0]) >= table.breaks) & real).sum() - 1, 0)
-    begin = _Parts(
-        share=jnp.zeros(()),
-        y=y,
-        piece=piece,
-        count=zero,
-        when=jnp.zeros((PARTS, STEPS + 1)),
-        place=jnp.broadcast_to(y, (PARTS, STEPS + 1, 2)),
-        pieces=jnp.broadcast_to(piece, (PARTS,)),
-    )
+    return _Way(jnp.zeros(()), y, piece, jnp.zeros((), int))
 
-    def one_part(at: _Parts) -> _Parts:
-        when, place, onward = _to_break(table, seen, duration, how, at)
-        factor = table.factor[jnp.minimum(at.piece + 1, table.factor.shape[0] - 1)]
-        return _Parts(
-            share=jnp.where(onward, when[-1], 1.0),
-            y=place[-1] * jnp.where(onward, jnp.stack([jnp.ones_like(factor), factor]), 1.0),
-            piece=at.piece + onward,
-            count=at.count + 1,
-            when=at.when.at[at.count].set(when),
-            place=at.place.at[at.count].set(place),
-            pieces=at.pieces.at[at.count].set(at.piece),
-        )
 
-    done = jax.lax.while_loop(lambda at: (at.share < 1) & (at.count < PARTS), one_part, begin)
-    steps = _arcs(table, seen, duration, done)
-    forces = sampled_slacks(table, seen, duration, steps, SAMPLES, linear_slacks).reshape(PARTS * STEPS * SAMPLES, -1)
-    span = (done.when[:, -1] - done.when[:, 0]) / (STEPS * intervals)
-    weight, pace_weight = (jnp.repeat(span / each, STEPS * each) for each in (SAMPLES, PACES))
-    y = jnp.where(done.share < 1, jnp.nan, done.y)
-    return Shot(
-        forces=jnp.where(weight[:, None] > 0, forces, 0.0),
-        weight=stop_gradient(weight),
-        pace=_paces(steps) / per_interval,
-        pace_weight=stop_gradient(pace_weight),
-        end=jnp.stack([(y[0] - table.breaks[0]) / table.length, y[1] / per_interval]),
+def _one_part(table: Table, how: Integration, intervals: int, at: _Way, q: Float[Array, "7"]) -> tuple[_Way, _Samples]:
+    """To the interval's end, or the end of the piece."""
+    values, zero = q[2:6].reshape(2, 2) * table.torque_limit, jnp.zeros((), int)
+    seen = Window(jnp.arange(2.0), values, values[1:] - values[:-1], zero, zero)
+    duration = jnp.exp(q[6]) / intervals
+    when, place, onward = _to_break(table, seen, duration, how, at)
+    factor = table.factor[jnp.minimum(at.piece + 1, table.factor.shape[0] - 1)]
+    after = _Way(
+        share=jnp.where(onward, when[-1], 1.0),
+        y=place[-1] * jnp.where(onward, jnp.stack([jnp.ones_like(factor), factor]), 1.0),
+        piece=at.piece + onward,
+        count=at.count + 1,
     )
+    steps = _arcs(table, seen, duration, when, place, at.piece)
+    forces = sampled_slacks(table, seen, duration, steps, SAMPLES, linear_slacks).reshape(STEPS * SAMPLES, -1)
+    span = stop_gradient(when[-1] - when[0]) / (STEPS * intervals)
+    weight, pace_weight = (jnp.full(STEPS * each, span / each) for each in (SAMPLES, PACES))
+    forces = jnp.where(span > 0, forces, 0.0)
+    return after, _Samples(forces, weight, _paces(steps) / (table.length / intervals), pace_weight)
+
+
+def _arcs(table: Table, seen: Window, duration, when, place, piece) -> Arcs:
+    """A part's steps."""
+    share, s, w = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (when, place[:, 0], place[:, 1]))
+    pieces, row = jnp.broadcast_to(piece, STEPS), jnp.zeros(STEPS, int)
+    live = share[:, 1] > share[:, 0]
+    quintic = jax.vmap(arc, (None, None, None, 0, 0, 0, 0, 0, 0))(table, seen, duration, share, s, w, pieces, row, live)
+    return Arcs(share, quintic, pieces, row, jnp.zeros(STEPS, bool), live)
 
 
 def _paces(steps: Arcs) -> Float[Array, "paces"]:
@@ -145,18 +170,7 @@ def _paces(steps: Arcs) -> Float[Array, "paces"]:
     return jnp.where(steps.live[:, None], slopes / jnp.where(steps.live, width, 1.0)[:, None], 1.0).ravel()
 
 
-def _arcs(table, seen, duration, done: _Parts) -> Arcs:
-    """The steps of all parts."""
-    pairs = [jnp.stack([a[:, :-1], a[:, 1:]], axis=2) for a in (done.when, done.place[..., 0], done.place[..., 1])]
-    share, s, w = (a.reshape(PARTS * STEPS, 2) for a in pairs)
-    piece = jnp.repeat(done.pieces, STEPS)
-    row, held = jnp.zeros_like(piece), jnp.zeros(piece.shape, bool)
-    live = share[:, 1] > share[:, 0]
-    each = jax.vmap(arc, (None, None, None, 0, 0, 0, 0, 0, 0))
-    return Arcs(share, each(table, seen, duration, share, s, w, piece, row, live), piece, row, held, live)
-
-
-def _to_break(table, seen, duration, how, at: _Parts):
+def _to_break(table, seen, duration, how, at: _Way):
     """Steps from where an interval has come to its end or the end of the piece, whichever is first.
 
     Returns the shares and states of the steps' ends, and whether the piece ended.

@@ -181,20 +181,20 @@ def _ends(seen: Window, steps: Steps, final):
 
 @eqx.filter_custom_vjp
 def reversible(inputs, field_of: Callable, past_of: Callable, how: Integration, final, limits, way) -> Steps:
-    """`found`, of `field_of(parameters)` until `past_of(limits)`, whose reverse mode goes back over its own steps.
+    """`found`, of `field_of(parameters, seen)` until `past_of(limits)`, whose reverse mode goes back over its own
+    steps.
 
     `inputs` are `(parameters, seen, begin, y)`, what it can be differentiated by. Each step is computed once more on
     the way back, from where it began, and none on the way there.
     """
     parameters, seen, begin, y = inputs
-    return found(field_of(parameters), seen, how, begin, final, y, past_of(limits), way)
+    return found(field_of(parameters, seen), seen, how, begin, final, y, past_of(limits), way)
 
 
 @reversible.def_fwd
-def _forth(_, inputs, field_of, past_of, how, final, limits, way):
+def _forth(_, inputs, *others):
     # Derivatives of a gradient would miss how the states between steps move.
-    parameters, seen, begin, y = eqxi.nondifferentiable(inputs)
-    steps = found(field_of(parameters), seen, how, begin, final, y, past_of(limits), way)
+    steps = reversible(eqxi.nondifferentiable(inputs), *others)
     return steps, steps
 
 
@@ -213,7 +213,7 @@ def _back(steps: Steps, gradient: Steps, perturbed, inputs, field_of, past_of, h
         parameters, seen, begin = eqx.combine(moved, kept)
         ends = _ends(seen, steps, final)
         begin = jnp.where(k > 0, pick(ends, jnp.maximum(k - 1, 0)), begin)
-        term, end, row = dfx.ODETerm(field_of(parameters)), pick(ends, k), pick(steps.row, k)
+        term, end, row = dfx.ODETerm(field_of(parameters, seen)), pick(ends, k), pick(steps.row, k)
         reused = solver.init(term, begin, end, y, row)
         return end, solver.step(term, begin, end, y, row, reused, made_jump=False)[0]
 
