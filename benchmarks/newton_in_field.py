@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Int
 
 from wholearm_jax.contacts import gaps
 from wholearm_jax.newton import newton
+from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Table, along_wire, balance, on_panel, powers
 from wholearm_jax.schedule import Window, interval, torque_in
 from wholearm_jax.system import System
@@ -87,7 +88,7 @@ def solve(way: Direct, piece, s, w, tau, duration):
     return z, x, answer[0], answer[1:] * way.system.force_unit
 
 
-@eqx.filter_jit
+@Program
 def move(way: Direct, seen: Window, duration, solver: dfx.AbstractSolver, tolerance, max_steps: int) -> Path:
     """Move from rest at the wire's start to its end or to the end of time."""
     share, y = jnp.zeros(()), jnp.stack([way.breaks[0], jnp.zeros(())])
@@ -106,13 +107,13 @@ def move(way: Direct, seen: Window, duration, solver: dfx.AbstractSolver, tolera
     return Path(jnp.stack(steps), jnp.stack(counts))
 
 
-@eqx.filter_jit
+@Program
 def moves(way: Direct, seen: Window, durations, solver: dfx.AbstractSolver, tolerance, max_steps: int) -> Path:
     """One phase after the other, in one program."""
     return jax.lax.map(lambda duration: move(way, seen, duration, solver, tolerance, max_steps), durations)
 
 
-@eqx.filter_jit
+@Program
 def states(way: Direct, seen: Window, duration, path: Path):
     """`z` and `z_dot` (SI) and `c_n` [N] at every step of a path."""
 

@@ -8,11 +8,12 @@ line in time, the smoothest that a schedule can hold. A run's error is the large
 reference is SciPy's DOP853 at 1e-13 on all five coordinates, which shares nothing with the package. Both end before the
 object comes to rest, and times within `APART` of a slip reversal, where forces jump, do not count.
 
-Every time is that of one phase, warm, taken in turn. The package is timed as `move` alone, called from Python and, as
-a share of `MANY` phases that follow one another, within a program; as simulating and scoring (`run`); and with tracing
+Every time is that of one phase, warm, taken in turn. The package is timed as `move` alone, called from Python and, as a
+share of `MANY` phases that follow one another, within a program; as simulating and scoring (`run`); and with tracing
 and tabulating the wire included. Newton's method, too, is timed called from Python and within a program. All of JAX's
-programs, of both sides, are compiled as `wholearm_jax.configure` says, and again in a second process as XLA does by
-itself (`PLAIN`). For each error level the ratio is between the fastest runs that are at least as good.
+programs, of both sides, are called as the package calls its own (`Program`) and compiled as `wholearm_jax.configure`
+says, and again in a second process as XLA does by itself (`PLAIN`). For each error level the ratio is between the
+fastest runs that are at least as good.
 """
 
 import argparse
@@ -31,7 +32,6 @@ from types import ModuleType
 from typing import Any
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -44,6 +44,7 @@ import wholearm_jax as wa
 from wholearm_jax import scene_file
 from wholearm_jax.motion import Motion, move
 from wholearm_jax.phase import Traced, prepare, run
+from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Table
 from wholearm_jax.sampling import sample
 from wholearm_jax.scene import body
@@ -175,18 +176,18 @@ class Call:
     phases: int = 1
 
 
-@eqx.filter_jit
+@Program
 def _move(table: Table, seen: Window, duration, how: wa.Integration) -> Motion:
     return move(table, seen, duration, how=how)
 
 
-@eqx.filter_jit
+@Program
 def _moves(table: Table, seen: Window, durations, how: wa.Integration) -> Motion:
     """One phase after the other."""
     return jax.lax.map(lambda duration: move(table, seen, duration, how=how), durations)
 
 
-@eqx.filter_jit
+@Program
 def _at_steps(table: Table, schedule, start, duration, motion: Motion):
     """`z`, `z_dot`, `c_n` at the motion's steps."""
     there = sample(table, schedule, start, duration, motion, motion.share)

@@ -93,7 +93,7 @@ def test_scenes_of_one_size_share_their_programs():
         scene = wa.load(name)
         with jax.log_compiles(False):
             wa.simulate(scene, wa.quasistatic(scene))
-        sizes = (prepare.plain._cached._cache_size(), _run.plain._cached._cache_size())
+        sizes = prepare.sizes(), _run.sizes()
         count(sizes)
     assert len(compiled) == 1, f"a later scene compiled again: {compiled}"
 

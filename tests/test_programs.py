@@ -78,6 +78,21 @@ def test_a_folder_that_cannot_be_written_to_does_no_harm(tmp_path):
     programs.keep(None)
 
 
+def test_with_no_folder_each_kind_of_arguments_is_traced_once():
+    TRACED.clear()
+    program = programs.Program(climb)
+    for power, at, expected in ((2, 3.0, 18.0), (3, 3.0, 54.0), (2, 4.0, 32.0), (2, [1.0, 2.0], [2.0, 8.0])):
+        found, others = program(Ramp(jnp.asarray(2.0), power), np.asarray(at))
+        assert found.slope.tolist() == expected
+        assert found.power == power
+        assert others["at"].tolist() == at
+    assert TRACED == [2, 3, 2], "settings and shapes have programs of their own, numbers have not"
+    assert program.sizes() == 3
+    assert float(program(Ramp(jnp.asarray(2.0), 2), jnp.asarray(3.0), 1)[0].slope) == 19.0
+    assert float(program(Ramp(jnp.asarray(2.0), 2), jnp.asarray(3.0), True)[0].slope) == 19.0
+    assert program.sizes() == 5, "1 and True are equal, and not the same setting"
+
+
 def test_transformations_pass_by(folder):
     program = programs.Program(climb)
     slopes = jax.vmap(lambda at: program(Ramp(jnp.asarray(2.0), 2), at)[0].slope)(jnp.arange(3.0))

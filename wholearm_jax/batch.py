@@ -258,7 +258,7 @@ def _check_apart(source: Source, numbers, schedule: Torque, arrival, level: Leve
 
     def local(arrays, numbers, schedule, arrival):
         source = eqx.combine(arrays, static)
-        return _check_here.plain(source, numbers, schedule, arrival, level, _beside(source, mesh))
+        return _check_here(source, numbers, schedule, arrival, level, _beside(source, mesh))
 
     each, whole = PartitionSpec("scenes"), PartitionSpec()
     mapped = jax.shard_map(local, mesh=mesh, in_specs=(whole, each, whole, whole), out_specs=each, check_vma=False)

@@ -13,6 +13,7 @@ Derivation: section 7 of `docs/derivation.md`.
 
 import math
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -34,7 +35,7 @@ FEW = 16  # steps sampled together
 GOLDEN = 14  # sections to a dip: Newton's step on the true motion follows
 
 
-class Score(eqx.Module):
+class Score(NamedTuple):
     """The least slack of a phase: `margin` [N], its time as a share of the phase, its `s` and the number of its row in
     the formation, `contact`.
 

@@ -18,7 +18,6 @@ Derivation: section 6 of `docs/derivation.md`.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
@@ -32,7 +31,7 @@ from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration, Steps, found, repeated, reversible
 
 
-class Motion(eqx.Module):
+class Motion(NamedTuple):
     """The accepted steps of a phase, `count` of them: from node `i` to node `i + 1` in time, `s` and `w`.
 
     Step `i` lies in piece `piece[i]` and torque interval `row[i]`; `held[i]` marks waiting at rest. `share` is time in

@@ -15,7 +15,7 @@ from wholearm_jax.contacts import GROUPS, PALM_END, ROOT
 from wholearm_jax.forces import Score, score
 from wholearm_jax.holding import Departure, Statics, statics
 from wholearm_jax.motion import Motion, move
-from wholearm_jax.precision import array
+from wholearm_jax.precision import given
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Change, Table, change, on_panel, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, contact_name
@@ -68,10 +68,10 @@ def run(
     `arrival` how near the wire's end the phase must come (`verdict`).
     """
     dtype = table.breaks.dtype
-    arriving = array(np.zeros(5), dtype) if arriving is None else arriving
-    start, duration, arrival = (array(a, dtype) for a in (start, duration, arrival))
+    arriving = np.zeros(5) if arriving is None else arriving
+    start, duration, arriving, arrival = (given(a, dtype) for a in (start, duration, arriving, arrival))
     how = tolerance_as_data(how, dtype)
-    goal = array(GOALS[goal] if isinstance(goal, str) else goal, int)
+    goal = given(GOALS[goal] if isinstance(goal, str) else goal, int)
     return _run(table, schedule, start, duration, arriving, how, goal, arrival)
 
 

@@ -12,6 +12,8 @@ tabulated as one polynomial a panel of the wire.
 Derivation: section 4 of `docs/derivation.md`.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -170,7 +172,7 @@ def blank(resolution: Resolution, contacts: int = 4) -> Table:
     return Table(count=one, error=zero, condition=zero, status=whole, **filled)
 
 
-class Change(eqx.Module):
+class Change(NamedTuple):
     """Entering a formation with speed: `ds/dt` [1/s] after the impact and the contacts' impulses [N s].
 
     `size` [N s] is the largest sum of magnitudes that makes up an impulse: against it rounding is judged.

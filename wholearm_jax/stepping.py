@@ -19,7 +19,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.lookup import pick
-from wholearm_jax.precision import array
+from wholearm_jax.precision import given
 from wholearm_jax.schedule import Window, interval, rounded
 
 Loop = Literal["lax", "bounded"]
@@ -48,7 +48,8 @@ class Integration(eqx.Module):
 
 def tolerance_as_data(how: Integration, dtype) -> Integration:
     """The same integration, with a tolerance that is an array: all tolerances share a program."""
-    return eqx.tree_at(lambda h: h.tolerance, how, array(how.tolerance, dtype))
+    tolerance = given(how.tolerance, dtype)
+    return how if tolerance is how.tolerance else replace(how, tolerance=tolerance)
 
 
 def with_room(how: Integration, rows: int) -> Integration:

@@ -1,6 +1,7 @@
 """Judge: what became of a simulated phase, from its motion and its score."""
 
-import equinox as eqx
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -21,7 +22,7 @@ GOALS = {"moving": 0, "caught": 0, "rest": 1, "hold": 2}
 PULL = 1e-9  # share of `Change.size` by which an impulse may be negative for rounding
 
 
-class Verdict(eqx.Module):
+class Verdict(NamedTuple):
     """A phase's `status`, when as a share of its duration, and the contact concerned (-1: none)."""
 
     status: Int[Array, ""]
