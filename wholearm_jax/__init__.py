@@ -2,9 +2,9 @@
 
 Read the modules in this order: `scene`, `contacts`, `system`, `march`, `start`, `places` and `wire` (trace),
 `reduction` (reduce), `schedule`, `stepping`, `landing` and `motion` (simulate), `forces` (score), `verdict`, `phase`,
-`result` and `plan`, `squeeze` (quasi-static torques and the bound), `shooting`, `linearisation`, `descent`, `pacing`,
-`guesses` and `optimiser` (optimise), `baseline` (the paper's search), `variation` and `batch` (many scenes at once),
-`free_bodies`, `coulomb`, `execution` and `perturbation` (virtual hardware).
+`result` and `plan`, `squeeze` (quasi-static torques and the bound), `shooting`, `linearisation`, `condensing`,
+`descent`, `pacing`, `guesses` and `optimiser` (optimise), `baseline` (the paper's search), `variation` and `batch`
+(many scenes at once), `free_bodies`, `coulomb`, `execution` and `perturbation` (virtual hardware).
 """
 
 from wholearm_jax.baseline import search

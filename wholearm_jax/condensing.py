@@ -55,15 +55,16 @@ class Following(NamedTuple):
     triangle: Float[Array, "states states"]
 
 
-def free(values: Shaped[Array, "*rows p"], at: Order) -> Shaped[Array, "*rows u"]:
+def free(linear: Linear, values: Shaped[Array, "*rows p"]) -> Shaped[Array, "*rows u"]:
     """Of numbers that belong to all variables, those of torques and durations."""
-    states = at.rows.size
+    states = order(*sizes(linear)).rows.size
     return jnp.concatenate([values[..., :states], values[..., 2 * states :]], axis=-1)
 
 
-def of_states(values: Shaped[Array, "*rows p"], at: Order) -> Shaped[Array, "*rows states"]:
+def of_states(linear: Linear, values: Shaped[Array, "*rows p"]) -> Shaped[Array, "*rows states"]:
     """Of numbers that belong to all variables, those of states."""
-    return values[..., at.rows.size : 2 * at.rows.size]
+    states = order(*sizes(linear)).rows.size
+    return values[..., states : 2 * states]
 
 
 def together(linear: Linear, u: Float[Array, "u"], x: Float[Array, "states"]) -> Float[Array, "p"]:
@@ -75,8 +76,8 @@ def following(linear: Linear) -> Following:
     """How states follow torques and durations, other than those that stay."""
     at = order(*sizes(linear))
     across, given = linear.across[at.rows], at.given[:, None]
-    triangle = jnp.where(given, jnp.eye(at.rows.size), of_states(across, at))
-    by_free = jnp.where(given | free(linear.still, at), 0.0, free(across, at))
+    triangle = jnp.where(given, jnp.eye(at.rows.size), of_states(linear, across))
+    by_free = jnp.where(given | free(linear, linear.still), 0.0, free(linear, across))
     apart = jnp.where(at.given, 0.0, linear.defect[at.rows])
     solved = -solve_triangular(triangle, jnp.column_stack([by_free, apart]), lower=True)
     return Following(solved[:, :-1], solved[:, -1], triangle)
@@ -96,16 +97,16 @@ def newton_step(linear: Linear, stiff, aim, damping) -> tuple[Float[Array, "p"],
     matrix = follow.matrix.at[at.goals].set(0.0)  # those are kept where they are
 
     def reduced(values: Float[Array, "p"]):
-        return free(values, at) + of_states(values, at) @ matrix
+        return free(linear, values) + of_states(linear, values) @ matrix
 
     def bent(way: Float[Array, "p"]):
         return scattered(linear, jnp.einsum("pkij,pkj->pki", bends, way[columns(linear)])) + price * way
 
-    pull, lean, still = gather(linear, aim), gather(linear, stiff * bears), free(linear.still, at)
+    pull, lean, still = gather(linear, aim), gather(linear, stiff * bears), free(linear, linear.still)
     apart = together(linear, jnp.zeros(still.size), follow.apart)
     curvature = jnp.where(still[:, None] | still, jnp.eye(still.size), _curvature(linear, bends, matrix, price))
     lower = reduced(lean)[None]
-    keep = jnp.concatenate([follow.matrix[at.goals], jnp.where(still, 0.0, free(linear.across[at.seams], at))])
+    keep = jnp.concatenate([follow.matrix[at.goals], jnp.where(still, 0.0, free(linear, linear.across[at.seams]))])
     defect = jnp.concatenate([follow.apart[at.goals], linear.defect[at.seams]])
     weight, none = (stiff * bears).sum(), jnp.zeros((defect.size, 1))
     system = jnp.block(
@@ -118,7 +119,7 @@ def newton_step(linear: Linear, stiff, aim, damping) -> tuple[Float[Array, "p"],
     right = [reduced(pull - bent(apart)), (1 - (bears * aim).sum() + lean @ apart)[None], -defect]
     u, level, kept = jnp.split(jnp.linalg.solve(system, jnp.concatenate(right)), [still.size, still.size + 1])
     way, level = together(linear, u, follow.matrix @ u + follow.apart), level[0]
-    push = of_states(pull - bent(way) + level * lean, at)
+    push = of_states(linear, pull - bent(way) + level * lean)
     held, seams = jnp.split(kept, [at.goals.size])
     joins = solve_triangular(follow.triangle, push.at[at.goals].set(-held), trans=1, lower=True)
     # Each equation but the seams' is that of one state.
@@ -132,14 +133,11 @@ def _curvature(linear: Linear, bends, matrix, price) -> Float[Array, "u u"]:
     An interval depends on one state, two torques beside each other and a duration. One half is made, and then added to
     what mirrors it.
     """
-    phases, knots = sizes(linear)
-    n, number = matrix.shape[1], np.arange(phases * knots).reshape(phases, knots)[:, :-1]
-    states = 2 * number[..., None] + np.arange(2)
-    duration = np.broadcast_to(n - phases + np.arange(phases)[:, None, None], (*number.shape, 1))
-    of_interval = np.concatenate([2 * number[..., None] + np.arange(4), duration], axis=2)
+    (size, n), at = matrix.shape, columns(linear)
+    states, others = at[..., :2] - size, at[..., 2:] - [0, 0, 0, 0, size]  # places among `x` and `u`
     moved = matrix[states]
     half = (price / 2 * matrix).at[states].add(jnp.einsum("pkij,pkju->pkiu", bends[..., :2, :2] / 2, moved))
-    half = half.at[states[..., None], of_interval[..., None, :]].add(bends[..., :2, 2:])
-    alone = jnp.zeros((n, n)).at[of_interval[..., None], of_interval[..., None, :]].add(bends[..., 2:, 2:] / 2)
+    half = half.at[states[..., None], others[..., None, :]].add(bends[..., :2, 2:])
+    alone = jnp.zeros((n, n)).at[others[..., None], others[..., None, :]].add(bends[..., 2:, 2:] / 2)
     whole = matrix.T @ half + alone + price / 2 * jnp.eye(n)
     return whole + whole.T

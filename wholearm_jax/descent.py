@@ -120,9 +120,7 @@ def _reach(value, change):
 
 def _cap(linear: Linear, way):
     """The share of a step that keeps the states' changes within `LONGEST`."""
-    phases, intervals = linear.at.room.shape[:2]
-    size = 2 * phases * (intervals + 1)
-    change = jnp.abs(way[size : 2 * size].reshape(-1, 2)).max(0)
+    change = jnp.abs(of_states(linear, way).reshape(-1, 2)).max(0)
     return (jnp.array(LONGEST) / jnp.maximum(change, 1e-30)).min()
 
 
@@ -153,18 +151,16 @@ def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) ->
         above = at.room - linear.bears * level
         # Outside a limit the loss is infinite: there the pull back to it is that of a small room.
         pull = gather(linear, hot * at.weight / jnp.maximum(above, hot))
-        at_knots, follow = order(*sizes(linear)), following(linear)
-        last = follow.matrix[at_knots.goals]
+        goals, follow = order(*sizes(linear)).goals, following(linear)
+        last = follow.matrix[goals]
 
         def arriving(step, rest):
             return step - last.T @ jnp.linalg.solve(last @ last.T, last @ step + rest)
 
-        gradient = arriving(-free(pull, at_knots) - of_states(pull, at_knots) @ follow.matrix, 0.0)
+        gradient = arriving(-free(linear, pull) - of_states(linear, pull) @ follow.matrix, 0.0)
         whole = together(linear, gradient, jnp.zeros_like(follow.apart))
         updates, inner = optimiser.update(whole, state.inner, params, **extra)
-        step = arriving(
-            free(jnp.where(linear.still, 0.0, jnp.asarray(updates)), at_knots), follow.apart[at_knots.goals]
-        )
+        step = arriving(free(linear, jnp.where(linear.still, 0.0, jnp.asarray(updates))), follow.apart[goals])
         way = together(linear, step, follow.matrix @ step + follow.apart)
         change = change_of_rooms(linear, way)
         within = (at.weight > 0) & (linear.bears == 0) & (at.room > 0)

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from wholearm_jax.landing import acceleration, single_step
 from wholearm_jax.lookup import pick
 from wholearm_jax.motion import Motion
-from wholearm_jax.reduction import Table, combined, polynomial, powers
+from wholearm_jax.reduction import Table, combined, derivative, polynomial, powers
 from wholearm_jax.schedule import Window, torque_in
 from wholearm_jax.stepping import Integration
 
@@ -98,7 +98,7 @@ def on_arc(one: Arcs, xi: Float[Array, ""]):
     """Share, `s` and `w` at `xi` of one arc (no leading axis)."""
     width = one.share[1] - one.share[0]
     s = polynomial(one.quintic, xi)
-    slope = polynomial(one.quintic[1:] * jnp.arange(1.0, 6.0), xi)
+    slope = polynomial(derivative(one.quintic), xi)
     moving = one.live & ~one.held & (width > 0)
     return one.share[0] + xi * width, s, jnp.where(moving, slope / jnp.where(moving, width, 1.0), 0.0)
 

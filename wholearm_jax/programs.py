@@ -59,14 +59,15 @@ class Program:
         key = tree, settings, folder, shapes
         call = self._calls.get(key)
         if call is None:
-            call = self._calls[key] = self._loaded(folder, arrays, tree, settings) or self._jitted(tree, settings)
+            kept = self._kept(folder, arrays, tree, settings) if folder else None
+            call = self._calls[key] = kept or jax.jit(self._of_arrays(tree, settings))
         return call(*arrays)
 
     def sizes(self) -> int:
         """How many programs it has compiled, other than those read."""
         return sum(call._cache_size() for call in self._calls.values() if hasattr(call, "_cache_size"))
 
-    def _jitted(self, tree, settings) -> Callable:
+    def _of_arrays(self, tree, settings) -> Callable:
         """The function of its arrays alone."""
 
         def flat(*arrays):
@@ -75,12 +76,10 @@ class Program:
             return self._function(*jax.tree.unflatten(tree, leaves))
 
         flat.__name__ = self._name
-        return jax.jit(flat)
+        return flat
 
-    def _loaded(self, folder: Path | None, arrays, tree, settings) -> Callable | None:
+    def _kept(self, folder: Path, arrays, tree, settings) -> Callable | None:
         """The kept program for arguments of one kind: read, or traced and written; None where none can be named."""
-        if folder is None:
-            return None
         own = [_identity(setting[1]) for setting in settings if setting is not None]
         names = [self._function.__module__, self._name, str(tree), *own]
         shapes = str([(array.shape, array.dtype) for array in arrays])
@@ -99,11 +98,11 @@ class Program:
 
     def _exported(self, arrays, tree, settings):
         """The exported program, and its result's shape with the number of its array in every leaf."""
-        shape, plain = None, self._jitted(tree, settings)
+        shape, function = None, self._of_arrays(tree, settings)
 
         def flat(*arrays):
             nonlocal shape
-            found, structure = jax.tree.flatten(plain.__wrapped__(*arrays))
+            found, structure = jax.tree.flatten(function(*arrays))
             shape = jax.tree.unflatten(structure, range(len(found)))
             return found
 

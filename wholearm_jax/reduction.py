@@ -220,6 +220,12 @@ def polynomial(coefficients: Float[Array, "powers ..."], xi: Float[Array, ""]) -
     return coefficients[0]
 
 
+def derivative(coefficients: Float[Array, "powers ..."]) -> Float[Array, "powers_1 ..."]:
+    """The coefficients of a polynomial's derivative, lowest power first."""
+    power = jnp.arange(1.0, coefficients.shape[0], dtype=coefficients.dtype)
+    return coefficients[1:] * power.reshape(-1, *(1,) * (coefficients.ndim - 1))
+
+
 def on_panel(coefficients: Float[Array, "panels powers ..."], panel: Int[Array, ""], xi: Float[Array, ""]):
     """The value of one of a table's functions at the place that `powers` tells."""
     return polynomial(pick(coefficients, panel), xi)
@@ -247,8 +253,7 @@ def _change_of_combined(primals, tangents):
     if turn is not None:
         total = values @ turn
     if rate is not None:
-        power = jnp.arange(1.0, coefficients.shape[0], dtype=values.dtype).reshape(-1, *(1,) * values.ndim)
-        total = total + polynomial(coefficients[1:] * power, xi) @ terms * rate
+        total = total + polynomial(derivative(coefficients), xi) @ terms * rate
     if change is not None:
         total = total + polynomial(change, xi) @ terms
     return values @ terms, total

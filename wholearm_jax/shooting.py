@@ -30,7 +30,7 @@ from jaxtyping import Array, Float, Int
 from wholearm_jax.forces import MOST_ROLLING, Arcs, arc, linear_slacks, sampled_slacks
 from wholearm_jax.landing import acceleration, single_step
 from wholearm_jax.lookup import pick
-from wholearm_jax.reduction import Table
+from wholearm_jax.reduction import Table, derivative
 from wholearm_jax.schedule import Window
 from wholearm_jax.stepping import Integration
 
@@ -109,8 +109,8 @@ def shoot(table: Table, how: Integration, intervals: int, q: Float[Array, "cut 7
         k = jnp.argmax(waiting(at))
         one = jax.tree.map(lambda a: pick(a, k), at)
         after, samples = part(one, pick(q, k))
-        at = jax.tree.map(lambda all, one: all.at[k].set(one), at, after)
-        return at, jax.tree.map(lambda all, new: all.at[k, one.count].set(new), all_parts, samples)
+        at = jax.tree.map(lambda a, new: a.at[k].set(new), at, after)
+        return at, jax.tree.map(lambda a, new: a.at[k, one.count].set(new), all_parts, samples)
 
     done, all_parts = jax.lax.while_loop(lambda state: jnp.any(waiting(state[0])), next_part, (first, all_parts))
     joined = jax.tree.map(lambda a: a.reshape(cut, -1, *a.shape[3:]), all_parts)
@@ -166,7 +166,7 @@ def _paces(steps: Arcs) -> Float[Array, "paces"]:
     """
     width = steps.share[:, 1] - steps.share[:, 0]
     basis = np.array([[math.comb(i, j) / math.comb(4, j) for j in range(5)] for i in range(PACES)])
-    slopes = (steps.quintic[:, 1:] * jnp.arange(1.0, 6.0)) @ basis.T
+    slopes = jax.vmap(derivative)(steps.quintic) @ basis.T
     return jnp.where(steps.live[:, None], slopes / jnp.where(steps.live, width, 1.0)[:, None], 1.0).ravel()
 
 
