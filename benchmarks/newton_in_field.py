@@ -20,10 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.contacts import gaps
-from wholearm_jax.newton import newton
+from wholearm_jax.newton import along_wire, newton
 from wholearm_jax.programs import Program
-from wholearm_jax.reduction import Table, along_wire, balance, on_panel, powers
+from wholearm_jax.reduction import Table, balance, on_panel, powers
 from wholearm_jax.schedule import Window, interval, torque_in
 from wholearm_jax.system import System
 from wholearm_jax.wire import Wire
@@ -64,7 +63,7 @@ def direct(system: System, wire: Wire, table: Table) -> Direct:
         piece = jnp.minimum((s >= wire.breaks[1:pieces]).sum(), pieces - 1)
         panel, xi = powers(table, piece, s)
         z = on_panel(table.configuration, panel, xi) / system.configuration_unit
-        return z, along_wire(system, z, wire.chart[0])[0]
+        return z, along_wire(system, z, wire.chart[0]).x
 
     z, x = jax.vmap(place)(s)
     signs = wire.slip_sign[:pieces], wire.joint_sign[:pieces]
@@ -76,16 +75,16 @@ def solve(way: Direct, piece, s, w, tau, duration):
     near = jnp.argmin(jnp.abs(way.s - s))
     height = way.chart @ way.anchor + s - way.anchor_s
 
-    def equations(z):
-        return jnp.concatenate([gaps(way.system.contacts, z), (way.chart @ z - height)[None]])
+    def above(system, z, x, height):
+        return way.chart @ z - height
 
-    z = newton(equations, way.z[near] + way.x[near] * (s - way.s[near])).z
-    x, bend, _ = along_wire(way.system, z, way.chart)
-    matrix, right = balance(way.system, z, x, bend, way.slip_sign[piece], way.joint_sign[piece])
+    z = newton(above, way.system, way.z[near] + way.x[near] * (s - way.s[near]), way.chart, height).z
+    at = along_wire(way.system, z, way.chart)
+    matrix, right = balance(way.system, z, at.x, at.bend, way.slip_sign[piece], way.joint_sign[piece])
     v = w / duration
     terms = jnp.concatenate([jnp.stack([jnp.ones_like(v), v**2, v]), tau / way.system.torque_unit])
     answer = jnp.linalg.solve(matrix, right @ terms)
-    return z, x, answer[0], answer[1:] * way.system.force_unit
+    return z, at.x, answer[0], answer[1:] * way.system.force_unit
 
 
 @Program

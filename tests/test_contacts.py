@@ -17,7 +17,6 @@ from wholearm_jax.contacts import (
     slip_rows,
     slips,
 )
-from wholearm_jax.march import oriented_tangent, tangent
 from wholearm_jax.scene import body
 from wholearm_jax.system import system
 
@@ -75,14 +74,3 @@ def test_curvature_of_all_that_may_meet(mechanics, seed):
 
         _, curvature = jax.jvp(slope, (z,), (x,))
         np.testing.assert_allclose(constraint_curvature(several, z, x), curvature, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-def test_the_tangent_and_its_derivatives(mechanics, mode):
-    """Against the null vector by elimination, derived through the elimination."""
-    z, hint = anywhere(6)
-    np.testing.assert_allclose(tangent(mechanics, z, hint), oriented_tangent(mechanics, z, hint)[0], **NEAR)
-    for argument in (0, 1):
-        found = mode(lambda z, hint: tangent(mechanics, z, hint), argument)(z, hint)
-        known = mode(lambda z, hint: oriented_tangent(mechanics, z, hint)[0], argument)(z, hint)
-        np.testing.assert_allclose(found, known, rtol=1e-11, atol=1e-11)

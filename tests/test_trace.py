@@ -1,7 +1,5 @@
 """Wires: where they start, how they end, what their tables hold."""
 
-from itertools import pairwise
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +8,6 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.contacts import gaps, normal_rows, slip_rows
-from wholearm_jax.newton import newton
 from wholearm_jax.phase import end_configuration, ending
 from wholearm_jax.reduction import combined, on_panel, powers
 from wholearm_jax.scene import body
@@ -28,18 +25,6 @@ def traced(request):
     scene = wa.load(request.param)
     mechanics = [system(body(scene.object), scene.hand, scene.gravity, p.formation) for p in scene.phases]
     return request.param, scene, wa.trace(scene), mechanics
-
-
-def test_newton_converges_quadratically():
-    """The error's logarithm at least doubles a step, on a root known in closed form."""
-
-    def function(z):
-        return jnp.stack([z[0] ** 2 - 2.0, z[0] * z[1] - 1.0])
-
-    exact = np.array([np.sqrt(2), np.sqrt(0.5)])
-    errors = [np.abs(np.asarray(newton(function, jnp.array([1.6, 0.6]), steps=k).z) - exact).max() for k in range(1, 4)]
-    for before, after in pairwise(errors):
-        assert after < 2 * before**2 + 1e-15
 
 
 def test_starts_and_ends_touch(traced):

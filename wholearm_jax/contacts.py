@@ -206,7 +206,11 @@ def along_rates(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -
 @jax.jit
 def slips(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "slots"]:
     """`G_t x` of the contacts that may slip; 0 for those that roll."""
-    at = frames(several, z)
+    return slips_at(several, frames(several, z), x)
+
+
+def slips_at(several: Contacts, at: Frame, x: Float[Array, "5"]) -> Float[Array, "slots"]:
+    """The same, where the contacts are known already."""
     return jnp.where(several.slides, _velocities(several, at, _turned(at.normal), x), 0.0)
 
 

@@ -32,7 +32,7 @@ SAMPLES = 7  # places in a step at which forces are sampled before the minimum i
 MOST_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
 REFINED = 4  # dips refined: those that parabolas through samples put lowest
 FEW = 16  # steps sampled together
-GOLDEN = 14  # sections to a dip: Newton's step on the true motion follows
+GOLDEN = 17  # sections to a dip: Newton's step on the true motion follows
 
 
 class Score(NamedTuple):
@@ -157,8 +157,8 @@ def sampled_slacks(
 def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion, how: Integration) -> Score:
     """The margin of a simulated phase.
 
-    The quintics find the place; the force there comes from one step of the solver that ends on it, so that the margin
-    is as accurate as the integration.
+    The quintics find the place; the force there comes from one step of the solver that ends beside it, so that the
+    margin is as accurate as the integration.
     """
     steps = arcs(table, seen, duration, motion)
     values = _values(*stop_gradient((table, seen, duration, steps)), motion.count)
@@ -170,27 +170,20 @@ def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion
         return (table, seen, duration, arc, pick(motion.entry_w, step)), step, contact
 
     def find(number):
-        """Where a dip is lowest, and about how low it goes there: exact to second order, without derivatives."""
+        """How low a dip goes, and where."""
         inputs, step, contact = stop_gradient(at(number))
-        arc, width = inputs[3], inputs[3].share[1] - inputs[3].share[0]
         seat, reach = jnp.argmin(pick(pick(values, step).T, contact)) / (SAMPLES - 1), 1.0 / (SAMPLES - 1)
-        xi = _minimise(lambda xi: pick(slacks_on(*inputs[:4], xi), contact), seat, reach)
-        here, curve, shift, slope, *_ = _dip(*inputs, how, contact, xi)
-        better = jnp.clip(xi + shift, jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0))
-        moved = (better - xi) * width
-        least = here + slope * moved + curve * moved**2 / 2
-        return jnp.where(arc.live & ~arc.held, least, jnp.inf), better
+        low, high = jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0)
+        xi = _minimise(lambda xi: pick(slacks_on(*inputs[:4], xi), contact), low, high)
+        return _dip(inputs, how, contact, xi, low, high)
 
     numbers = _lowest(_dips(values).ravel(), REFINED)
     least, places = stop_gradient(jax.vmap(find)(numbers))
     best = jnp.argmin(least)
     inputs, _, contact = at(pick(numbers, best))
-    xi, arc = stop_gradient(pick(places, best)), inputs[3]
-    margin, curve, shift, slope, share, s = _dip(*inputs, how, contact, xi)
-    # To second order the least value, whose derivative is that at the true minimum.
-    shift = stop_gradient((jnp.clip(xi + shift, 0.0, 1.0) - xi) * (arc.share[1] - arc.share[0]))
-    margin = margin + slope * shift + stop_gradient(curve) * shift**2 / 2
-    margin = jnp.where(arc.live & ~arc.held, margin, jnp.inf)
+    xi = pick(places, best)
+    margin = _carried(inputs, how, contact, xi, pick(least, best))
+    share, s, _ = on_arc(inputs[3], xi)
     lost, lost_contact = _first_loss(*stop_gradient((table, seen, duration, steps)), values)
     between = (margin < 0) & ~jnp.isfinite(lost)  # a dip that no sample shows
     lost = jnp.where(between, stop_gradient(share), lost)
@@ -264,12 +257,13 @@ def _dips(values: Float[Array, "steps samples rows"]) -> Float[Array, "steps row
     return jnp.where(jnp.isfinite(least), jnp.minimum(least, lowest), jnp.inf)
 
 
-def _dip(table, seen, duration, arc, entry_w, how, contact, xi):
-    """A constraint's slack at `xi` of a step of the true motion, about its minimum.
+def _dip(inputs, how: Integration, contact, xi, low, high):
+    """A constraint's least slack about `xi` of a step of the true motion, and where in `[low, high]` that is.
 
-    The value, its second derivative (the quintic's) and how far in `xi` its minimum lies by Newton's step (0 at the
-    step's ends and where it does not curve up), its slope, and share and `s` there; derivatives are per share.
+    To second order: the value and slope where a step of the solver ends at `xi`, the second derivative that of the
+    quintic. The derivative, the place held, is that at the true minimum.
     """
+    table, seen, duration, arc, entry_w = inputs
     width = arc.share[1] - arc.share[0]
     share, begin = arc.share[0] + xi * width, jnp.stack([arc.quintic[0], entry_w])
     s, w = single_step(table, seen, duration, how, arc.piece, arc.row, arc.share[0], begin, xi * width)
@@ -282,7 +276,23 @@ def _dip(table, seen, duration, arc, entry_w, how, contact, xi):
     wide = jnp.where(width > 0, width, 1.0)
     curve = _second(lambda xi: pick(slacks_on(table, seen, duration, arc, xi), contact), xi) / wide**2
     inner = (xi > 0) & (xi < 1) & (curve > 0)
-    return value, curve, jnp.where(inner, -slope / jnp.where(inner, curve, 1.0) / wide, 0.0), slope, share, s
+    better = jnp.clip(xi - jnp.where(inner, slope / jnp.where(inner, curve, 1.0) / wide, 0.0), low, high)
+    way = stop_gradient((better - xi) * width)
+    least = value + slope * way + stop_gradient(curve) * way**2 / 2
+    return jnp.where(arc.live & ~arc.held, least, jnp.inf), better
+
+
+@eqx.filter_custom_jvp
+def _carried(inputs, how, contact, xi, least):
+    """The `least` slack that was found at `xi`, with the derivatives of `_dip`."""
+    return least
+
+
+@_carried.def_jvp
+def _(primals, tangents):
+    (inputs, how, contact, xi, least), (change, *_) = primals, tangents
+    _, rate = eqx.filter_jvp(lambda inputs: _dip(inputs, how, contact, xi, 0.0, 1.0)[0], (inputs,), (change,))
+    return least, rate
 
 
 def _second(function, x):
@@ -291,13 +301,12 @@ def _second(function, x):
     return jax.jvp(lambda x: jax.jvp(function, (x,), (along,))[1], (x,), (along,))[1]
 
 
-def _minimise(function, seat, reach):
-    """About the least point of `function` within `reach` of `seat` in [0, 1], by golden section.
+def _minimise(function, low, high):
+    """About the least point of `function` in `[low, high]`, by golden section.
 
     A bracket's end counts where it is lower.
     """
     golden = (math.sqrt(5) - 1) / 2
-    low, high = jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0)
 
     def narrow(k, state):
         """Both ends first, then the two inner points; each round keeps the part that holds the lower one."""
@@ -311,14 +320,13 @@ def _minimise(function, seat, reach):
         high = jnp.where((k > 0) & (lower == 0), points[1], high)
         return low, high, jnp.where(better, points[lower], best), jnp.minimum(values[lower], least)
 
-    start = (low, high, seat * jnp.ones_like(low), jnp.full_like(low, jnp.inf))
+    start = (low, high, low, jnp.full_like(low, jnp.inf))
     return stop_gradient(jax.lax.fori_loop(0, GOLDEN, narrow, start)[2])
 
 
 def _first_loss(table, seen, duration, steps, values):
     """The share at which a contact's slack first turns negative, by bisection from the first sample that is."""
-    least = values.min(2)
-    negative = least < 0
+    negative = (values < 0).any(2)
     first = jnp.argmax(negative.ravel())
     step, sample = first // SAMPLES, first % SAMPLES
     arc = jax.tree.map(lambda a: pick(a, step), steps)
@@ -334,6 +342,6 @@ def _first_loss(table, seen, duration, steps, values):
         return jnp.where(gone, low, middle), jnp.where(gone, middle, high), contact
 
     bracket = (jnp.maximum(high - width, 0.0), high, jnp.argmin(values[step, sample]))
-    _, xi, contact = jax.lax.fori_loop(0, 50, halve, bracket)
+    _, xi, contact = jax.lax.fori_loop(0, jnp.where(jnp.any(negative), 50, 0), halve, bracket)
     share = on_arc(arc, xi)[0]
     return jnp.where(jnp.any(negative), share, jnp.inf), contact

@@ -13,13 +13,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.lax import stop_gradient
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.contacts import (
     along_rates,
-    constraint_rates,
     constraint_rows,
     constraints,
     frames,
@@ -35,16 +33,6 @@ from wholearm_jax.system import System
 
 LONGEST, SHORTEST = 0.06, 2e-3  # march steps, and the step at which an end counts as bracketed
 CHARTS = 8  # directions that a wire may be charted by, one after the other
-
-
-def tangent(system: System, z: Float[Array, "5"], hint: Float[Array, "5"]) -> Float[Array, "5"]:
-    """Unit null vector of `G` with a positive component along `hint`; carries first derivatives."""
-    fixed, here, along = stop_gradient((system, z, hint))
-    inverted, _ = inverse(jnp.concatenate([constraint_rows(fixed.contacts, here), along[None]]))
-    x = inverted[:, 4]
-    left = jnp.append(constraint_rates(system.contacts, z, x), hint @ x - 1.0)  # of G x = 0, hint . x = 1
-    x = x - times(inverted, left)
-    return x / jnp.sqrt((x**2).sum())
 
 
 def oriented_tangent(system: System, z, hint):
@@ -113,11 +101,11 @@ def march(system: System, heading: Heading, z: Float[Array, "5"], x: Float[Array
     tolerance = digits(z, 5 / 8)
     sense = jnp.where(heading.until_value < z[heading.until_coordinate], -1.0, 1.0)
     sense = jnp.where(heading.until_coordinate < 0, 1.0, sense)
-    begin = _begin(system, z, x, _watch(system, heading, sense, z, x, x), tolerance, capacity)
 
     def step(m: March) -> March:
         return _step(system, lambda z, x, u: _watch(system, heading, sense, z, x, u), tolerance, m)
 
+    begin = _begin(z, x, system.candidates.lower.shape[0], system.contacts.lower.shape[0], capacity)
     return _ended(system, jax.lax.while_loop(lambda m: ~m.done, step, begin), tolerance)
 
 
@@ -137,31 +125,32 @@ def _watch(system, heading, sense, z, x, u) -> Watched:
     )
 
 
-def _begin(system, z, x, watched, tolerance, capacity) -> March:
-    """A march that has come nowhere yet."""
+def _begin(z, x, pairs: int, slots: int, capacity: int) -> March:
+    """A march that has no node yet. Its first step has no length: it looks about at the start."""
 
     def buffer(row):
         return jnp.zeros((capacity, *row.shape), row.dtype).at[0].set(row)
 
-    speeds = speeds_of(system, z, x)
+    none, watch = jnp.zeros(6, z.dtype), pairs + 2 * slots + 1
+    nothing = Watched(jnp.full(watch, -jnp.inf, z.dtype), jnp.zeros(watch, z.dtype), jnp.zeros(pairs, z.dtype))
     return March(
-        n=jnp.asarray(1, int),
-        step=jnp.asarray(LONGEST, z.dtype),
+        n=jnp.asarray(0, int),
+        step=jnp.zeros((), z.dtype),
         z=buffer(z),
         x=buffer(x),
         s=jnp.full(capacity, jnp.inf, z.dtype).at[0].set(0.0),
-        speeds=speeds,
-        sense=signs_of(speeds, tolerance),
-        flips=buffer(jnp.zeros(7, bool)),
-        share=buffer(jnp.zeros(7, z.dtype)),
-        orientation=buffer(oriented_tangent(system, z, x)[1]),
+        speeds=none,
+        sense=none,
+        flips=jnp.zeros((capacity, 7), bool),
+        share=jnp.zeros((capacity, 7), z.dtype),
+        orientation=jnp.zeros(capacity, z.dtype),
         chart=jnp.zeros(capacity, int),
         charts=jnp.zeros((CHARTS, 5), z.dtype).at[0].set(x),
         anchors=jnp.zeros((CHARTS, 5), z.dtype).at[0].set(z),
         anchor_s=jnp.zeros(CHARTS, z.dtype),
         number=jnp.asarray(0, int),
-        before=watched,
-        beyond=watched,
+        before=nothing,
+        beyond=nothing,
         end=jnp.asarray(-1, int),
         end_z=z,
         status=jnp.asarray(0, int),
@@ -172,7 +161,7 @@ def _begin(system, z, x, watched, tolerance, capacity) -> March:
 def _step(system, watch, tolerance, m: March) -> March:
     """Try one step: keep its node, take a shorter one, or find that the wire ends within the shortest."""
     capacity = m.s.shape[0]
-    last, u = m.n - 1, pick(m.charts, m.number)
+    last, u = jnp.maximum(m.n - 1, 0), pick(m.charts, m.number)
     z, x, s = pick(m.z, last), pick(m.x, last), pick(m.s, last)
     z_new, moved, inverted, determinant = correct(system, u, _predicted(m), u @ z + m.step, 4, tolerance)
     x_new, orientation = _normalised(inverted, determinant)
@@ -197,7 +186,7 @@ def _step(system, watch, tolerance, m: March) -> March:
     in_chart = watched._replace(rates=watched.rates * jnp.where(turn, u @ x_new, 1.0))
     return m._replace(
         n=m.n + (accept | bracketed),
-        step=jnp.where(accept, jnp.minimum(m.step * 1.5, LONGEST), shorter),
+        step=jnp.where(accept, jnp.where(m.n > 0, jnp.minimum(m.step * 1.5, LONGEST), LONGEST), shorter),
         z=m.z.at[place].set(z_new, mode="drop"),
         x=m.x.at[place].set(x_new, mode="drop"),
         s=m.s.at[place].set(s_new, mode="drop"),
@@ -220,7 +209,7 @@ def _step(system, watch, tolerance, m: March) -> March:
 
 def _predicted(m: March):
     """The next node, by the cubic through the last two nodes and their tangents; the first by its tangent alone."""
-    u, last = pick(m.charts, m.number), m.n - 1
+    u, last = pick(m.charts, m.number), jnp.maximum(m.n - 1, 0)
     before = jnp.maximum(last - 1, 0)
     z, z_before, x, x_before = pick(m.z, last), pick(m.z, before), pick(m.x, last), pick(m.x, before)
     slope, slope_before = x / (u @ x), x_before / (u @ x_before)

@@ -1,4 +1,4 @@
-"""Places on a wire: its end and its kinks, each the root of five equations, and whether it meets another wire.
+"""Places on a wire: its end and its kinks, each where something vanishes, and whether the wire meets another one.
 
 Derivation: section 3 of `docs/derivation.md`.
 """
@@ -10,16 +10,18 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.contacts import constraints, frames
-from wholearm_jax.march import SHORTEST, March, oriented_tangent, speeds_of, tangent
+from wholearm_jax.contacts import frames, slips_at
+from wholearm_jax.lookup import pick
+from wholearm_jax.march import SHORTEST, March, oriented_tangent
 from wholearm_jax.newton import newton
 from wholearm_jax.precision import digits
 
 
 class Places(NamedTuple):
-    """The wire's end and its kinks in order; `s` is infinite for unused rows."""
+    """The wire's end and its kinks in order, with their tangents `x`; `s` is infinite for unused rows."""
 
     z: Float[Array, "places 5"]
+    x: Float[Array, "places 5"]
     s: Float[Array, "places"]
     chart: Int[Array, "places"]
     end: Float[Array, "5"]
@@ -28,7 +30,7 @@ class Places(NamedTuple):
     failed: Bool[Array, ""]
 
 
-_PLANE, _END = 6, 7  # fifth equations: 0-3 slip of a contact, 4-5 speed of a joint, then these
+_PLANE, _END = 6, 7  # what vanishes: 0-3 slip of a contact, 4-5 speed of a joint, then these
 
 
 def places_of(system, heading, marched: March, most: int) -> Places:
@@ -47,16 +49,15 @@ def places_of(system, heading, marched: March, most: int) -> Places:
     chart = marched.chart[jnp.maximum(segment - (what == _PLANE), 0)]
 
     def locate(segment, what, guess, chart):
-        hint = marched.x[jnp.maximum(segment - 1, 0)]
+        hint = pick(marched.x, jnp.maximum(segment - 1, 0))
 
-        def equations(z, system, heading):
-            fifth = _fifth(system, heading, marched, z, hint, guess)[what]
-            return jnp.concatenate([constraints(system.contacts, z), fifth[None]])
+        def vanishing(system, z, x, heading):
+            return _vanishing(system, heading, marched, z, x, hint @ (z - guess))[what]
 
-        root = newton(equations, guess, system, heading)
-        return root.z, root.residual, coordinate(marched, chart, root.z)
+        root = newton(vanishing, system, guess, hint, heading)
+        return root.z, root.x, root.residual, coordinate(marched, chart, root.z)
 
-    z, residual, s = jax.vmap(locate)(segment, what, guess, chart)
+    z, x, residual, s = jax.vmap(locate)(segment, what, guess, chart)
     slack = jnp.where(what == _END, 4 * SHORTEST, digits(z, 3 / 8))
     before = jnp.where(segment > 0, marched.s[jnp.maximum(segment - 1, 0)], 0.0)
     astray = (residual > digits(z, 1 / 2)) | (s < before - slack) | (s > marched.s[segment] + slack)
@@ -64,21 +65,21 @@ def places_of(system, heading, marched: March, most: int) -> Places:
     kinks = jnp.where(used[:-1], s[:-1], jnp.inf)
     rank = jnp.argsort(stop_gradient(kinks))
     branched = _branches(fixed, marched, stop_gradient(z[-1]), astray[-1])
-    return Places(z[rank], kinks[rank], chart[rank], z[-1], s[-1], branched, failed)
+    return Places(z[rank], x[rank], kinks[rank], chart[rank], z[-1], s[-1], branched, failed)
 
 
-def _fifth(system, heading, marched, z, hint, plane):
-    """The equations that may fix a place on the wire beside the C-functions; the last is what ends the wire."""
-    x = tangent(system, z, hint)
-    pairs = system.candidates.lower.shape[0]
-    made = jax.tree.map(lambda a: a[jnp.clip(marched.end, 0, pairs - 1)], system.candidates)
-    held = frames(system.contacts, z)
-    room = [held.along - system.contacts.lower, system.contacts.upper - held.along]
-    ahead = heading.until_value - z[heading.until_coordinate]
-    others = jnp.concatenate([*room, ahead[None]])
-    ending = jnp.where(marched.end < pairs, frames(made, z).gap, others[jnp.maximum(marched.end - pairs, 0)])
-    still = hint @ (z - plane)
-    return jnp.concatenate([speeds_of(system, z, x), jnp.stack([still, jnp.where(marched.end < 0, still, ending)])])
+def _vanishing(system, heading, marched, z, x, ahead_of_guess):
+    """What may fix a place on the wire by vanishing there: `speeds_of`, the way from the guess, what ends the wire."""
+    pairs, slots = system.candidates.lower.shape[0], system.contacts.lower.shape[0]
+    made = jnp.clip(marched.end, 0, pairs - 1)
+    several = jax.tree.map(lambda a, b: jnp.append(a, pick(b, made)[None], axis=0), system.contacts, system.candidates)
+    at = frames(several, z)
+    room = [(at.along - several.lower)[:slots], (several.upper - at.along)[:slots]]
+    coordinate = heading.until_value - pick(z, jnp.maximum(heading.until_coordinate, 0))
+    others = jnp.concatenate([*room, coordinate[None]])
+    ending = jnp.where(marched.end < pairs, at.gap[slots], pick(others, jnp.maximum(marched.end - pairs, 0)))
+    ending = jnp.where(marched.end < 0, ahead_of_guess, ending)
+    return jnp.concatenate([slips_at(several, at, x)[:slots], x[3:], jnp.stack([ahead_of_guess, ending])])
 
 
 def _branches(system, marched, end, astray):

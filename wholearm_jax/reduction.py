@@ -21,9 +21,10 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.contacts import constraint_curvature, constraint_rows, slip_rows
+from wholearm_jax.contacts import constraint_rows, slip_rows
 from wholearm_jax.elimination import inverse, times
 from wholearm_jax.lookup import pick
+from wholearm_jax.newton import along_wire
 from wholearm_jax.precision import array, digits
 from wholearm_jax.status import Status
 from wholearm_jax.system import System, configuration_unit
@@ -87,17 +88,6 @@ def balance(system: System, z, x, bend, slip_sign, joint_sign):
     return matrix, jnp.stack([dry, -system.inertia * bend, viscous, *torque], axis=1)
 
 
-def along_wire(system: System, z, u):
-    """`x = dz/ds`, `x' = d2z/ds2` and `det [G; u]` in the chart with direction `u`.
-
-    They solve `G x = 0`, `u.x = 1`, `G x' = -x^T H x`.
-    """
-    rows = jnp.concatenate([constraint_rows(system.contacts, z), u[None]])
-    inverted, determinant = inverse(rows)
-    x = inverted[:, 4]
-    return x, -times(inverted[:, :4], constraint_curvature(system.contacts, z, x)), determinant
-
-
 def reduce_wire(system: System, wire: Wire) -> Table:
     """Solve the 5x5 system at every node of a wire, and at its start for those who enter with speed; tabulate."""
     shape = wire.nodes.shape[:2]
@@ -106,14 +96,15 @@ def reduce_wire(system: System, wire: Wire) -> Table:
     chart, xi, turn = wire.chart[owner], wire.slip_sign[owner], wire.joint_sign[owner]
 
     def node(z, u, slip_sign, joint_sign):
-        x, bend, chart_determinant = along_wire(system, z, u)
+        along = along_wire(system, z, u)
+        x, bend = along.x, along.bend
         matrix, right = balance(system, z, x, bend, slip_sign, joint_sign)
         back, resting = balance(system, z, x, bend, -slip_sign, -joint_sign)
         # Friction may turn the determinant's sign only by passing through a singular matrix.
         inverted, determinants = jax.vmap(inverse)(jnp.stack([matrix, back]))
         with_friction, turned = stop_gradient(determinants)
         # Without friction, det [M x, -G^T] = x.M x det [G; u]: of M x only the part along x is not in the span of G^T.
-        without = stop_gradient(system.inertia @ x**2 * chart_determinant)
+        without = stop_gradient(system.inertia @ x**2 * along.determinant)
         upright = with_friction * without
         ahead, behind = inverted[0], inverted[1, 0]
         solution = times(ahead, right)

@@ -10,14 +10,17 @@ from jax.lax import stop_gradient
 
 from wholearm_jax.contacts import GROUPS, PALM_END, ROOT, constraint_rows, constraints, frames
 from wholearm_jax.elimination import inverse, solve, times
-from wholearm_jax.march import tangent
+from wholearm_jax.march import oriented_tangent
 from wholearm_jax.newton import newton
 from wholearm_jax.precision import digits
 from wholearm_jax.scene import EDGE
 
 
 def project(system, rough):
-    """The wire's point nearest to the rough start: least-norm Newton steps to reach it, then Newton on nearness."""
+    """The wire's point nearest to the rough start: least-norm Newton steps to reach it, then Newton on nearness.
+
+    Beside it how far constraints are from holding there, and a unit vector along the wire, of either sense.
+    """
     fixed, far = stop_gradient(system), stop_gradient(rough)
 
     def least(z):
@@ -27,14 +30,11 @@ def project(system, rough):
         return z + move * jnp.minimum(1.0, 0.3 / jnp.maximum(jnp.abs(move).max(), 1e-30))
 
     z = jax.lax.fori_loop(0, 12, lambda _, z: least(z), far)
-    hint = _null(fixed, z)
-
-    def nearest(z, system, rough):
-        return jnp.concatenate([constraints(system.contacts, z), (tangent(system, z, hint) @ (z - rough))[None]])
-
-    root = newton(nearest, z, system, rough)
+    root = newton(lambda system, z, x, rough: x @ (z - rough), system, z, _null(fixed, z), rough)
     near = jnp.where(root.residual < digits(z, 3 / 8), root.z, z)
-    return near, jnp.abs(constraints(fixed.contacts, stop_gradient(near))).max()
+    fixed_near = stop_gradient(near)
+    along, _ = oriented_tangent(fixed, fixed_near, stop_gradient(root.x))
+    return near, jnp.abs(constraints(fixed.contacts, fixed_near)).max(), along
 
 
 def misplaced(system, z):
@@ -94,17 +94,17 @@ def dependent(system, z):
 
 
 def _null(system, z):
-    """The unit tangent at `z`, of either sense: the longest column of the projector onto what is orthogonal to `G`."""
+    """About the unit tangent at `z`, of either sense: the longest column of the projector onto what is orthogonal to
+    `G`, which has half of the digits where rows are nearly dependent."""
     rows = constraint_rows(system.contacts, z)
     projector = jnp.eye(5, dtype=z.dtype) - times(rows.T, solve(times(rows, rows.T), rows))
-    # The projector has half of the digits where rows are nearly dependent, which is enough for a hint.
-    return tangent(system, z, projector[jnp.argmax(jnp.diag(projector))])
+    longest = projector[jnp.argmax(jnp.diag(projector))]
+    return longest / jnp.sqrt((longest**2).sum())
 
 
-def oriented(system, z, heading):
-    """The unit tangent at `z` whose coordinate `heading.coordinate` has the sign asked for."""
-    null = _null(system, z)
-    return null * jnp.where(null[leading(heading, null)] * heading.sign < 0, -1.0, 1.0)
+def oriented(along, heading):
+    """A tangent, turned so that its coordinate `heading.coordinate` has the sign asked for."""
+    return along * jnp.where(along[leading(heading, along)] * heading.sign < 0, -1.0, 1.0)
 
 
 def leading(heading, x):

@@ -4,8 +4,8 @@ Four C-functions (gaps, and the places where rolling contacts touch) in five unk
 geometry alone. It is charted by the linear coordinate
 `s = s_ref + u . (z - z_ref)` (object units, see `system`), `u` being the unit tangent where the chart begins; a wire
 that turns away from `u` continues in a new chart, so turning points of single coordinates are nothing special. The
-search for its end and its kinks (`march`) runs on constants; every place that it finds is then the root of five
-equations in five unknowns, from which derivatives follow (`newton`).
+search for its end and its kinks (`march`) runs on constants; at every place that it finds something vanishes on the
+wire, from which derivatives follow (`newton`).
 
 A wire is cut into *pieces* where a contact's slip or a joint's speed reverses, or the chart changes: within a piece
 everything is smooth. Pieces are cut into panels with Chebyshev nodes, at which `reduction` tabulates.
@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from wholearm_jax.contacts import constraint_rows, constraints, placed
 from wholearm_jax.elimination import times
-from wholearm_jax.march import correct, march, signs_of, speeds_of, tangent
+from wholearm_jax.march import correct, march, signs_of, speeds_of
 from wholearm_jax.places import coordinate, places_of
 from wholearm_jax.precision import digits
 from wholearm_jax.scene import Heading
@@ -102,8 +102,8 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     system = eqx.tree_at(lambda s: s.contacts, system, placed(system.contacts, rough))
     fixed, fixed_heading = stop_gradient(system), stop_gradient(heading)
 
-    start, residual = project(system, rough)
-    first_tangent = oriented(fixed, stop_gradient(start), fixed_heading)
+    start, residual, along = project(system, rough)
+    first_tangent = oriented(along, fixed_heading)
     marched = march(fixed, fixed_heading, stop_gradient(start), first_tangent, resolution.march)
     places = places_of(system, heading, marched, resolution.pieces)
     wire = _cut(system, fixed, marched, places, start, resolution)
@@ -139,7 +139,7 @@ def chebyshev(nodes: int) -> np.ndarray:
     return -np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)
 
 
-def _lay(system, marched, places, start, resolution) -> Pieces:
+def _lay(marched, places, start, resolution) -> Pieces:
     """Cut the wire into its pieces, each in the chart that it is charted by."""
     inside = jnp.isfinite(places.s) & (stop_gradient(places.s) < stop_gradient(places.end_s))
     count = inside.sum() + 1
@@ -161,14 +161,14 @@ def _lay(system, marched, places, start, resolution) -> Pieces:
     breaks = jnp.concatenate([coordinate(marched, 0, start)[None], kinks, end_s[None]])
 
     old = marched.charts[before]
-    x_entry = jax.vmap(lambda z, u: tangent(system, z, u))(entry, old)
-    factor = jnp.where(live, (chart * x_entry).sum(1) / (old * x_entry).sum(1), 1.0)
+    before_entry = jnp.where(live[1:], (old[1:] * places.x).sum(1), 1.0)
+    factor = jnp.append(1.0, jnp.where(live[1:], (chart[1:] * places.x).sum(1) / before_entry, 1.0))
     return Pieces(count, breaks, chart, anchor, anchor_s, factor)
 
 
 def _cut(system, fixed, marched, places, start, resolution):
     """Lay panels over the pieces and solve the C-functions at every node."""
-    laid = _lay(system, marched, places, start, resolution)
+    laid = _lay(marched, places, start, resolution)
     first, panels, owner = _panels(stop_gradient(laid.breaks), laid.count, resolution)
     local = (jnp.arange(resolution.panels) - first[owner])[:, None] + (chebyshev(resolution.nodes) + 1) / 2
     low, high = laid.breaks[owner][:, None], laid.breaks[owner + 1][:, None]

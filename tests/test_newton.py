@@ -1,0 +1,112 @@
+"""Newton's method along a wire, against a general method on the same equations, differences and closed forms."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import root
+
+import wholearm_jax as wa
+from wholearm_jax.contacts import constraint_rows, constraints, slip_rows
+from wholearm_jax.newton import along_wire, newton
+from wholearm_jax.scene import body
+from wholearm_jax.system import system
+
+
+@pytest.fixture(scope="module")
+def flip():
+    """The heptagon's second phase: its system, a place on its wire, the tangent there, and where the third contact's
+    slip turns round."""
+    scene = wa.load("heptagon")
+    phase, wire = scene.phases[1], wa.trace(scene)[1].wire
+    mechanics = system(body(scene.object), scene.hand, scene.gravity, phase.formation)
+    near = wire.nodes[int(wire.first[1]) - 2, 0]
+    return mechanics, near, along_wire(mechanics, near, wire.chart[0]).x, int(jnp.argmin(slip_at(mechanics, wire)))
+
+
+def slip_at(mechanics, wire):
+    """How little each contact slips where the first piece ends."""
+    place = wire.nodes[int(wire.first[1])].mean(0)
+    return jnp.abs(slip_rows(mechanics.contacts, place) @ along_wire(mechanics, place, wire.chart[0]).x)
+
+
+def turns(system, z, x, contact):
+    """The slip of a contact."""
+    return slip_rows(system.contacts, z)[contact] @ x
+
+
+def known(mechanics, guess, contact):
+    """The same place by MINPACK, from rows alone: its tangent is a null vector of NumPy's."""
+
+    def equations(z):
+        rows = np.asarray(constraint_rows(mechanics.contacts, z))
+        null = np.linalg.svd(rows)[2][-1]
+        null = null / (null @ np.linalg.svd(rows0)[2][-1])
+        return np.append(
+            constraints(mechanics.contacts, z), np.asarray(slip_rows(mechanics.contacts, z))[contact] @ null
+        )
+
+    rows0 = np.asarray(constraint_rows(mechanics.contacts, guess))
+    found = root(equations, guess, tol=1e-14)
+    assert np.abs(found.fun).max() < 1e-12
+    return found.x
+
+
+def test_a_place_is_the_one_that_a_general_method_finds(flip):
+    mechanics, near, u, contact = flip
+    found = newton(turns, mechanics, near, u, contact)
+    np.testing.assert_allclose(found.z, known(mechanics, np.asarray(near), contact), atol=1e-11)
+    np.testing.assert_allclose(constraint_rows(mechanics.contacts, found.z) @ found.x, 0.0, atol=1e-14)
+    assert float(u @ found.x) == pytest.approx(1.0, abs=1e-14)
+    assert float(found.residual) < 1e-8
+
+
+def test_the_digits_double_with_every_second_step(flip):
+    """From off the wire, where neither the constraints hold nor the slip vanishes."""
+    mechanics, near, u, contact = flip
+    far = near + 0.02 * jnp.asarray([1.0, -1.0, 1.0, 1.0, -1.0])
+    exact = newton(turns, mechanics, near, u, contact).z
+    errors = [float(jnp.abs(newton(turns, mechanics, far, u, contact, steps=k).z - exact).max()) for k in range(1, 6)]
+    for before, after in zip(errors, errors[2:], strict=False):
+        assert after < before**2 + 1e-14
+    assert errors[0] > 1e-4
+    assert errors[-1] < 1e-14
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivatives_of_places_and_tangents(flip, mode):
+    """With respect to the object's corners, against differences of the general method's roots."""
+    mechanics, near, u, contact = flip
+    way = jnp.asarray(np.random.default_rng(0).normal(size=mechanics.contacts.point.shape))
+
+    def moved(amount):
+        return eqx.tree_at(lambda m: m.contacts.point, mechanics, mechanics.contacts.point + amount * way)
+
+    def place(amount):
+        found = newton(turns, moved(amount), near, u, contact)
+        return jnp.stack([found.z, found.x])
+
+    step = 1e-4
+
+    def exactly(amount):
+        z = known(moved(amount), np.asarray(near), contact)
+        return np.stack([z, along_wire(moved(amount), jnp.asarray(z), u).x])
+
+    one, two = ((exactly(k * step) - exactly(-k * step)) / (2 * k * step) for k in (1, 2))
+    np.testing.assert_allclose(mode(place)(0.0), (4 * one - two) / 3, rtol=1e-7, atol=1e-8)
+
+
+def test_what_is_not_there_is_not_found(flip):
+    """Nothing to be seen but a large residual, and finite numbers, derivatives included."""
+    mechanics, near, u, _ = flip
+
+    def nowhere(system, z, x, level):
+        return level + (z[2] - near[2]) ** 2
+
+    found = newton(nowhere, mechanics, near, u, 1.0)
+    assert float(found.residual) > 0.5
+    slope = jax.jacfwd(lambda level: newton(nowhere, mechanics, near, u, level).z)(1.0)
+    assert bool(jnp.isfinite(found.z).all() & jnp.isfinite(found.x).all() & jnp.isfinite(slope).all())
+    singular = newton(turns, mechanics, near, jnp.zeros(5), 0)
+    assert bool(jnp.isfinite(singular.z).all() & jnp.isfinite(singular.x).all())
