@@ -88,10 +88,7 @@ def test_two_devices_find_what_one_does(command, whole, tmp_path):
         np.testing.assert_allclose(*both, rtol=1e-9, atol=1e-12)
 
 
-FOUR = pytest.mark.skipif((os.cpu_count() or 1) < 4, reason="four processes that compile take a minute on two cores")
-
-
-@pytest.mark.parametrize("number", [2, pytest.param(4, marks=FOUR)])
+@pytest.mark.parametrize("number", [2, 4])
 def test_several_processes_leave_what_one_does(command, whole, tmp_path, number):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
