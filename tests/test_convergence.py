@@ -1,6 +1,7 @@
 """The order of convergence is the method's, across torque knots and a slip reversal."""
 
 from functools import cache
+from pathlib import Path
 
 import diffrax as dfx
 import equinox as eqx
@@ -15,6 +16,7 @@ from wholearm_jax.reduction import blank
 from wholearm_jax.schedule import padded, window
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
+from wholearm_jax.variation import vary
 from wholearm_jax.wire import Resolution
 
 LOOSE = 1e6  # a tolerance that accepts every step: steps are what lies between knots
@@ -70,3 +72,22 @@ def test_order_across_knots_and_a_slip_reversal(solver, order, parts):
     observed = np.log(coarse / fine) / np.log(parts[1] / parts[0])
     print(f"{type(solver).__name__}: errors {coarse:.1e}, {fine:.1e}, observed order {observed:.2f}")
     assert observed > order - 0.5
+
+
+def test_an_object_that_rests_within_a_step_is_stopped_and_set_out_again():
+    """At 0.27 of the second phase it comes to rest for an eightieth, less than a step of most tolerances: the speed at
+    steps' ends shows nothing, and carried on the object would slide back with the friction of forward travel."""
+    varied = {"vertices": 0.0006, "friction": "60%", "mass": "20%"}
+    scene = vary(wa.load("heptagon"), varied, seed=1).draw(1107)
+    schedule = wa.read_torque(Path(__file__).parent.parent / "benchmarks" / "data" / "heptagon_knots.csv")
+    traced = wa.trace(scene)
+    margins = []
+    for tolerance in (1e-5, 1e-7, 1e-9, 1e-12):
+        phase = wa.simulate(scene, schedule, traced=traced, arrival=0.02, tolerance=tolerance).phases[1]
+        motion = phase.outcome.motion
+        rest = np.asarray(motion.held)
+        assert rest.sum() == 1
+        assert np.diff(motion.share)[rest] == pytest.approx(0.01254, abs=1e-4)
+        assert (np.diff(motion.s) >= 0).all()
+        margins.append(float(phase.margin))
+    np.testing.assert_allclose(margins, margins[-1], rtol=0, atol=1e-7)

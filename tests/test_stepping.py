@@ -1,5 +1,6 @@
 """Steps by their error: they end on knots, keep their length across them, and stop at the first that comes past."""
 
+import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.schedule import window
-from wholearm_jax.stepping import Integration, found, repeated, reversible
+from wholearm_jax.stepping import Integration, Stop, found, repeated, reversible
 
 NEVER = -jnp.inf
 
@@ -17,13 +18,18 @@ def spring(share, y, row):
     return jnp.stack([y[1], -9.0 * y[0]])
 
 
-def steps_of(knots, *, past=NEVER, **how):
+def stop_at(past, longest=jnp.inf):
+    """Stop where `s` falls below `past`; steps longer than `longest` may have been there."""
+    return Stop(lambda y: y[0] < past, lambda y, after, rates, width: width > longest)
+
+
+def steps_of(knots, *, past=NEVER, longest=jnp.inf, **how):
     """Steps from 0 to 1 of a schedule with these knots, from `s = 1` at rest."""
     schedule = wa.torque(knots, np.zeros((len(knots), 2)))
     seen, how = window(schedule, jnp.zeros(()), jnp.ones(())), Integration(**how)
     one = jnp.ones(())
     y = jnp.stack([one, 0 * one])
-    steps = jax.jit(lambda y: found(spring, seen, how, 0 * one, one, y, lambda y: y[0] < past, one))(y)
+    steps = jax.jit(lambda y: found(spring, seen, how, 0 * one, one, y, stop_at(past, longest), one))(y)
     return steps, seen, how, y
 
 
@@ -55,6 +61,36 @@ def test_the_first_step_that_comes_past_is_the_last():
     assert steps.y[count - 1, 0] < 0.3
 
 
+def test_steps_that_may_have_been_past_are_taken_by_halves():
+    """And no others: those that follow grow again, to be halved again."""
+    knots = [0.0, 1.0]
+    (free, *_), (held, *_) = steps_of(knots, tolerance=1e-4), steps_of(knots, tolerance=1e-4, longest=0.1)
+    widths = [np.diff(np.append(0.0, s.end[: int(s.count)])) for s in (free, held)]
+    assert widths[0].max() > 0.2
+    assert 0.05 <= widths[1].max() <= 0.1
+    assert bool(held.complete)
+    assert np.asarray(held.y[int(held.count) - 1]) == pytest.approx([np.cos(3.0), -3 * np.sin(3.0)], abs=1e-4)
+
+
+def test_rates_at_the_ends_of_steps_are_the_field_s():
+    """By a solver that knows them and by one that does not: given to the stop times the step's width."""
+    for solver in (dfx.Dopri8(), dfx.Ralston()):
+        seen = []
+
+        def between(y, after, rates, width, seen=seen):
+            jax.debug.callback(lambda *each: seen.append(each), y, after, *rates, width)
+            return width < 0
+
+        schedule = window(wa.torque([0.0, 1.0], np.zeros((2, 2))), jnp.zeros(()), jnp.ones(()))
+        how, one = Integration(solver=solver, tolerance=1e-3), jnp.ones(())
+        stop = Stop(lambda y: y[0] < NEVER, between)
+        jax.block_until_ready(found(spring, schedule, how, 0 * one, one, jnp.stack([one, 0 * one]), stop, one))
+        assert len(seen) > 2
+        for y, after, first, last, width in seen:
+            np.testing.assert_allclose(first, width * spring(0, y, 0), rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(last, width * spring(0, after, 0), rtol=1e-12, atol=1e-12)
+
+
 def test_steps_that_run_out_are_not_complete():
     steps, *_ = steps_of(np.linspace(0.0, 1.0, 33), max_steps=16)
     assert int(steps.count) == 16
@@ -83,8 +119,9 @@ def spring_of(stiffness, seen):
     return lambda share, y, row: jnp.stack([y[1], -stiffness * y[0]])
 
 
-def never(limits):
-    return lambda y: y[0] < limits
+def never(limit):
+    """Nothing ends the steps."""
+    return stop_at(limit)
 
 
 def test_steps_are_gone_back_over():

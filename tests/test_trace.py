@@ -8,11 +8,12 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.contacts import gaps, normal_rows, slip_rows
-from wholearm_jax.phase import end_configuration, ending
+from wholearm_jax.phase import end_configuration, ending, prepare
 from wholearm_jax.reduction import combined, on_panel, powers
 from wholearm_jax.scene import body
 from wholearm_jax.scene_file import to_dict
 from wholearm_jax.system import system
+from wholearm_jax.wire import Resolution
 
 ENDS = {
     "heptagon": ("finger2:v4 is made", "palm:v0 is made"),
@@ -199,3 +200,58 @@ def test_combined_functions_have_the_derivatives_of_a_sum_of_products():
     twice = [jax.jacfwd(jax.jacrev(f, (1, 2)), (1, 2))(*given) for f in (plain, ours)]
     for exact, found in zip(*map(jax.tree.leaves, twice), strict=True):
         np.testing.assert_allclose(found, exact, rtol=1e-12, atol=1e-14)
+
+
+def at_places(table, shares):
+    """All of a table's functions at shares of its wire."""
+
+    def one(s):
+        piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
+        panel, xi = powers(table, piece, s)
+        names = ("acceleration", "backward", "force", "configuration", "velocity")
+        return [on_panel(getattr(table, name), panel, xi) for name in names]
+
+    return jax.vmap(one)(table.breaks[0] + shares * table.length)
+
+
+@pytest.mark.parametrize("phase", [0, 1])
+def test_a_table_knows_its_error(phase):
+    """Against one with many panels, relative to each function's size; where it is told, it is not told for nothing."""
+    scene, shares = wa.load("heptagon"), jnp.linspace(0.001, 0.999, 333)
+    fine = at_places(traced_with(scene, phase, 256), shares)
+    told = []
+    for panels in (6, 12, 24):
+        table = traced_with(scene, phase, panels)
+        errors = [
+            float((jnp.abs(a - b).max(0) / jnp.maximum(jnp.abs(b).max(0), 1e-5 * jnp.abs(b).max())).max())
+            for a, b in zip(at_places(table, shares), fine, strict=True)
+        ]
+        told.append(float(table.error))
+        rounding = 2e-10  # of functions a hundred thousand times smaller than their companions
+        assert max(errors) < max(told[-1], rounding)
+        assert told[-1] < max(20 * max(errors), rounding)
+    if phase == 1:  # the functions of the first are at rounding already
+        assert told[0] > 100 * told[1] > 1e4 * told[2]
+
+
+def traced_with(scene, phase, panels):
+    """One phase's table, not refined."""
+    told, rough = scene.phases[phase], scene.start if phase == 0 else end_configuration(wa.trace(scene)[0])
+    resolution = Resolution(panels=panels)
+    return prepare(body(scene.object), scene.hand, scene.gravity, told.formation, rough, told.heading, resolution).table
+
+
+def test_tables_are_refined_until_they_are_good_enough_or_refused():
+    """A wire on which friction nearly wedges the object has functions that no number of panels serves."""
+    scene, few = wa.load("heptagon"), Resolution(panels=8)
+    panels = {}
+    for tolerance in (1e-4, 1e-9):
+        tables = [one.table for one in wa.trace(scene, resolution=few, tolerance=tolerance)]
+        assert all(float(table.error) <= tolerance for table in tables)
+        panels[tolerance] = [table.acceleration.shape[0] for table in tables]
+    assert max(panels[1e-4]) < max(panels[1e-9]) < 512
+    rough = eqx.tree_at(lambda s: s.object.friction, scene, jnp.full(3, 0.6))
+    table = wa.trace(rough)[1].table
+    assert wa.Status(int(table.status)) is wa.Status.NO_CONVERGENCE
+    assert float(table.error) > 1e-9
+    assert table.acceleration.shape[0] == 512

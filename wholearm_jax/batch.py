@@ -75,7 +75,7 @@ class Level(NamedTuple):
     error: float
 
 
-QUICK = Level(Resolution(4, 12, 8, 64), Integration(tolerance=1e-8, max_steps=96, stages=4), 5e-6)
+QUICK = Level(Resolution(4, 8, 8, 64), Integration(tolerance=1e-8, max_steps=96, stages=4), 5e-7)
 FULL = Level(Resolution(), Integration(), 1e-9)
 
 
@@ -282,8 +282,8 @@ def check_scene(scene: Scene, schedule: Torque, arrival, level: Level) -> tuple[
     failed = stops.status != int(Status.OK)
     where = jnp.where(failed.any(), jnp.argmax(failed), jnp.argmin(stops.margin))
     last = jnp.where(failed.any(), where, len(scene.phases) - 1)
-    # What follows a failure counts for nothing but the margin.
-    needed = jnp.arange(len(scene.phases)) <= last
+    # What follows a failure counts for nothing but the margin; where it has none, that is known.
+    needed = (jnp.arange(len(scene.phases)) <= last) | (stops.status != int(Status.NO_CONVERGENCE))
     ok = ~failed.any()
     answer = Checked(
         status=stops.status[where],

@@ -326,7 +326,7 @@ def _minimise(function, low, high):
 
 def _first_loss(table, seen, duration, steps, values):
     """The share at which a contact's slack first turns negative, by bisection from the first sample that is."""
-    negative = (values < 0).any(2)
+    negative = (values < 0).any(2)  # their least would go to a library of XLA's, with threads of its own
     first = jnp.argmax(negative.ravel())
     step, sample = first // SAMPLES, first % SAMPLES
     arc = jax.tree.map(lambda a: pick(a, step), steps)

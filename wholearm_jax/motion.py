@@ -28,7 +28,7 @@ from wholearm_jax.lookup import pick
 from wholearm_jax.reduction import Table, on_panel, powers
 from wholearm_jax.schedule import Window, interval, torque_in
 from wholearm_jax.status import Status
-from wholearm_jax.stepping import Integration, Steps, found, repeated, reversible
+from wholearm_jax.stepping import Integration, Steps, Stop, found, repeated, reversible
 
 
 class Motion(NamedTuple):
@@ -221,17 +221,18 @@ def _integrate(table, seen, duration, how, state, final, goal, floor) -> Steps:
     """Steps from the state to `final` or to the first that passes `goal` or falls below the speed `floor`."""
     limits, final = stop_gradient(((goal, floor), final))
     way = limits[0] - stop_gradient(state.s)
+    least = how.tolerance + 64 * jnp.finfo(state.s.dtype).eps * jnp.abs(stop_gradient(state.s))
     parameters = table, duration, state.piece
     begin, y = state.share, jnp.stack([state.s, state.w])
     if how.adjoint == "reverse":
-        return reversible((parameters, seen, begin, y), _field, _past, how, final, limits, way)
+        return reversible((parameters, seen, begin, y), _field, _stop, how, final, (*limits, least), way)
 
     def solve(method, parameters, seen, begin, y, *more):
         return method(_field(parameters, seen), seen, how, begin, final, y, *more)
 
     inputs = parameters, seen, begin, y
     fixed = inputs if how.adjoint == "none" else stop_gradient(inputs)
-    steps = solve(found, *fixed, _past(limits), way)
+    steps = solve(found, *fixed, _stop((*limits, least)), way)
     return steps if how.adjoint == "none" else solve(repeated, *inputs, steps)
 
 
@@ -245,10 +246,26 @@ def _field(parameters, seen: Window):
     return field
 
 
-def _past(limits):
-    """Whether a state passes the goal, or falls below a speed."""
-    goal, floor = limits
-    return lambda y: (y[0] > goal) | (y[1] < floor)
+def _stop(limits) -> Stop:
+    """A state past the goal or below the floor, a speed; and a step on which the object may have come to rest and set
+    out again: one of the coefficients of `ds/du` by Bernstein's polynomials is negative, between which it stays.
+
+    Those of the quartic with the right speeds and accelerations at both ends and the right way between them. Going back
+    by the `least` way, which the tolerance does not see, does not count.
+    """
+    goal, floor, least = limits
+
+    def past(y):
+        return (y[0] > goal) | (y[1] < floor)
+
+    def between(y, after, rates, width):
+        first, last = rates[0][0], rates[1][0]
+        second, fourth = first + rates[0][1] * width / 4, last - rates[1][1] * width / 4
+        third = 5 * (after[0] - y[0]) - first - second - fourth - last
+        lowest = jnp.minimum(jnp.minimum(second, third), fourth)
+        return jnp.isfinite(floor) & (after[1] >= floor) & (lowest < -least)
+
+    return Stop(past, between)
 
 
 def _append(state, wanted, share, s, w, entry_w, row, *, held):

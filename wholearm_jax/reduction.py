@@ -12,6 +12,8 @@ tabulated as one polynomial a panel of the wire.
 Derivation: section 4 of `docs/derivation.md`.
 """
 
+import functools
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -126,8 +128,7 @@ def reduce_wire(system: System, wire: Wire) -> Table:
         "configuration": wire.nodes * unit,
         "velocity": x * unit,
     }
-    fitted = {name: jnp.einsum("kn,pn...->pk...", _TO_POWERS[wire.nodes.shape[1]], c) for name, c in columns.items()}
-    error = jnp.stack([_tail(c) for c in columns.values()]).max()
+    fitted, error = _fitted(columns)
     worst = condition.max()
     eps = jnp.finfo(x.dtype).eps
     broken = (worst > 0.01 / eps) | ~(upright.min() > 0)
@@ -253,36 +254,43 @@ def _change_of_combined(primals, tangents):
 _combined.defjvp(_change_of_combined, symbolic_zeros=True)
 
 
-def _tail(values):
-    """The last two Chebyshev coefficients of every panel against the largest value of each function.
+def _fitted(columns: dict[str, Float[Array, "panels nodes *shape"]]) -> tuple[dict[str, Array], Float[Array, ""]]:
+    """Polynomials through the values of functions at the nodes, and the largest of their errors (`_error`)."""
+    every = jnp.concatenate([c.reshape(*c.shape[:2], -1) for c in columns.values()], axis=2)
+    to_powers, to_last = _transforms(every.shape[1])
+    ends = np.cumsum([math.prod(c.shape[2:]) for c in columns.values()])[:-1]
+    powers, lasts = (
+        jnp.split(jnp.einsum("kn,pnc->pkc", matrix, values), ends, axis=2)
+        for matrix, values in ((to_powers, every), (to_last, stop_gradient(every)))
+    )
+    fitted = {name: each.reshape(c.shape) for (name, c), each in zip(columns.items(), powers, strict=True)}
+    errors = [_error(c.reshape(*c.shape[:2], -1), last) for c, last in zip(columns.values(), lasts, strict=True)]
+    return fitted, jnp.stack(errors).max()
+
+
+def _error(values: Float[Array, "panels nodes functions"], last: Float[Array, "panels four functions"]):
+    """The largest error of polynomials, relative to the largest value of each function, by the last four Chebyshev
+    coefficients of every panel.
+
+    Two by two they shrink by `r`, and if those beyond do so, too, their sum is `r / (1 - r)` times that of the last
+    two; twice that bounds the error of interpolation. Where they hardly shrink, as by rounding, the last two count
+    themselves.
 
     Functions a hundred thousand times smaller than their largest companion (in float32, two hundred times: what should
     be zero is rounding) are judged against that.
     """
-    coefficients = jnp.einsum("kn,pn...->pk...", _TO_CHEBYSHEV[values.shape[1]], stop_gradient(values))
-    tail = jnp.abs(coefficients[:, -2:]).sum(1).max(0)
-    size = jnp.abs(values).max((0, 1))
+    before, tail = jnp.abs(last[:, :2]).sum(1), jnp.abs(last[:, 2:]).sum(1)
+    beyond = jnp.where(3 * tail < before, 2 * tail / jnp.where(tail < before, before - tail, 1.0), 1.0)
+    size = jnp.abs(stop_gradient(values)).max((0, 1))
     least = digits(values, 1 / 3) * size.max() + jnp.finfo(values.dtype).tiny
-    return (tail / jnp.maximum(size, least)).max()
+    return ((tail * beyond).max(0) / jnp.maximum(size, least)).max()
 
 
-def _transforms(nodes):
+@functools.cache
+def _transforms(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """From values at Chebyshev nodes to the coefficients of powers, and to the last four Chebyshev coefficients."""
     x = chebyshev(nodes)
     to_chebyshev = np.linalg.inv(np.polynomial.chebyshev.chebvander(x, nodes - 1))
     series = [np.polynomial.chebyshev.cheb2poly(np.eye(nodes)[k]) for k in range(nodes)]
     to_powers = sum(np.outer(np.pad(p, (0, nodes - len(p))), to_chebyshev[k]) for k, p in enumerate(series))
-    return to_chebyshev, to_powers
-
-
-class _Cache(dict):
-    """Constant matrices by number of nodes."""
-
-    def __init__(self, which):
-        self.which = which
-
-    def __missing__(self, nodes):
-        self[nodes] = _transforms(nodes)[self.which]
-        return self[nodes]
-
-
-_TO_CHEBYSHEV, _TO_POWERS = _Cache(0), _Cache(1)
+    return to_powers, to_chebyshev[-4:]

@@ -86,13 +86,21 @@ class _Step(NamedTuple):
     steps: Steps
 
 
-def found(
-    field: Callable, seen: Window, how: Integration, begin, final, y, past: Callable, way: Float[Array, ""]
-) -> Steps:
-    """Steps by their error from `begin` to `final`, or to the first that comes `past(y)`; each ends at a knot at most.
+class Stop(NamedTuple):
+    """What ends steps: `past(y)` says that a state is beyond, `between(y, after, rates, width)` that a step may have
+    been and come back; `rates` are `dy/du` at its ends times its `width`."""
+
+    past: Callable
+    between: Callable
+
+
+def found(field: Callable, seen: Window, how: Integration, begin, final, y, stop: Stop, way: Float[Array, ""]) -> Steps:
+    """Steps by their error from `begin` to `final`, or to the first that comes past its `stop`; each ends at a knot at
+    most.
 
     `field(share, y, row)` is `dy/du` in an interval of the schedule. The first step is a 32nd of the phase, or half of
-    `way` at the speed there, if that is shorter.
+    `way` at the speed there, if that is shorter. A step that may have been beyond the stop between its ends is taken
+    again by halves.
     """
     errors = dfx.PIDController(rtol=how.tolerance, atol=how.tolerance)
     solver, term = _with_stages(how.solver, "lax"), dfx.ODETerm(field)
@@ -102,15 +110,26 @@ def found(
 
     def cut(begin, size, number):
         """Where a step ends: on the interval's end, rather than next to it or beyond."""
-        stop = jnp.minimum(jnp.where(number < seen.last, pick(seen.share, number + 1), final), final)
-        return jnp.where(begin + size > stop - 100 * eps, stop, begin + size)
+        knot = jnp.minimum(jnp.where(number < seen.last, pick(seen.share, number + 1), final), final)
+        return jnp.where(begin + size > knot - 100 * eps, knot, begin + size)
+
+    def rates(at: _Step, y, dense):
+        """`dy/du` at a step's ends times its length, which most solvers know."""
+        if isinstance(solver, dfx.AbstractRungeKutta) and solver.tableau.fsal:
+            return dense["k"][0], dense["k"][-1]
+        ends = field(at.begin, at.y, at.row), field(at.end, y, at.row)
+        return tuple((at.end - at.begin) * rate for rate in ends)
 
     def attempt(at: _Step) -> _Step:
-        y, miss, _, reused, _ = solver.step(term, at.begin, at.end, at.y, at.row, at.reused, at.jumped)
+        y, miss, dense, reused, _ = solver.step(term, at.begin, at.end, at.y, at.row, at.reused, at.jumped)
         error = jnp.asarray(miss)
         error = jnp.where(jnp.isnan(error), jnp.inf, error)
         kept, *span, _, control, _ = errors.adapt_step_size(at.begin, at.end, at.y, y, None, error, order, at.control)
+        halved = kept & stop.between(at.y, y, rates(at, y, dense), at.end - at.begin)
+        kept = kept & ~halved
+        control = jax.tree.map(lambda old, new: jnp.where(halved, old, new), at.control, control)
         begin, end = (jnp.asarray(share) for share in span)
+        begin, end = jnp.where(halved, at.begin, begin), jnp.where(halved, (at.begin + at.end) / 2, end)
         # What a knot cut short says nothing against the length that was meant.
         size = jnp.where(kept, jnp.maximum(end - begin, at.size), end - begin)
         row = interval(seen, begin)
@@ -120,7 +139,7 @@ def found(
             row=at.steps.row.at[place].set(at.row, mode="drop"),
             y=at.steps.y.at[place].set(y, mode="drop"),
             count=at.steps.count + kept,
-            passed=kept & past(y),
+            passed=kept & stop.past(y),
         )
         y, reused = jax.tree.map(lambda new, old: jnp.where(kept, new, old), (y, reused), (at.y, at.reused))
         jumped = jnp.where(kept, row != at.row, at.jumped) if how.steps else False
@@ -181,15 +200,15 @@ def _ends(seen: Window, steps: Steps, final):
 
 
 @eqx.filter_custom_vjp
-def reversible(inputs, field_of: Callable, past_of: Callable, how: Integration, final, limits, way) -> Steps:
-    """`found`, of `field_of(parameters, seen)` until `past_of(limits)`, whose reverse mode goes back over its own
+def reversible(inputs, field_of: Callable, stop_of: Callable, how: Integration, final, limits, way) -> Steps:
+    """`found`, of `field_of(parameters, seen)` until `stop_of(limits)`, whose reverse mode goes back over its own
     steps.
 
     `inputs` are `(parameters, seen, begin, y)`, what it can be differentiated by. Each step is computed once more on
     the way back, from where it began, and none on the way there.
     """
     parameters, seen, begin, y = inputs
-    return found(field_of(parameters, seen), seen, how, begin, final, y, past_of(limits), way)
+    return found(field_of(parameters, seen), seen, how, begin, final, y, stop_of(limits), way)
 
 
 @reversible.def_fwd
@@ -200,7 +219,7 @@ def _forth(_, inputs, *others):
 
 
 @reversible.def_bwd
-def _back(steps: Steps, gradient: Steps, perturbed, inputs, field_of, past_of, how, final, limits, way):
+def _back(steps: Steps, gradient: Steps, perturbed, inputs, field_of, stop_of, how, final, limits, way):
     parameters, seen, begin, y = inputs
     moved, kept = eqx.partition((parameters, seen, begin), perturbed[:3])
     solver = solver_of(how)
