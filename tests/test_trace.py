@@ -218,9 +218,9 @@ def at_places(table, shares):
 def test_a_table_knows_its_error(phase):
     """Against one with many panels, relative to each function's size; where it is told, it is not told for nothing."""
     scene, shares = wa.load("heptagon"), jnp.linspace(0.001, 0.999, 333)
-    fine = at_places(traced_with(scene, phase, 256), shares)
+    fine = at_places(traced_with(scene, phase, Resolution().panels), shares)
     told = []
-    for panels in (6, 12, 24):
+    for panels in (8, 16):
         table = traced_with(scene, phase, panels)
         errors = [
             float((jnp.abs(a - b).max(0) / jnp.maximum(jnp.abs(b).max(0), 1e-5 * jnp.abs(b).max())).max())
@@ -231,7 +231,7 @@ def test_a_table_knows_its_error(phase):
         assert max(errors) < max(told[-1], rounding)
         assert told[-1] < max(20 * max(errors), rounding)
     if phase == 1:  # the functions of the first are at rounding already
-        assert told[0] > 100 * told[1] > 1e4 * told[2]
+        assert told[0] > 100 * told[1]
 
 
 def traced_with(scene, phase, panels):
@@ -251,7 +251,7 @@ def test_tables_are_refined_until_they_are_good_enough_or_refused():
         panels[tolerance] = [table.acceleration.shape[0] for table in tables]
     assert max(panels[1e-4]) < max(panels[1e-9]) < 512
     rough = eqx.tree_at(lambda s: s.object.friction, scene, jnp.full(3, 0.6))
-    table = wa.trace(rough)[1].table
+    table = wa.trace(rough, resolution=Resolution(panels=512))[1].table
     assert wa.Status(int(table.status)) is wa.Status.NO_CONVERGENCE
     assert float(table.error) > 1e-9
     assert table.acceleration.shape[0] == 512

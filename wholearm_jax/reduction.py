@@ -292,5 +292,5 @@ def _transforms(nodes: int) -> tuple[np.ndarray, np.ndarray]:
     x = chebyshev(nodes)
     to_chebyshev = np.linalg.inv(np.polynomial.chebyshev.chebvander(x, nodes - 1))
     series = [np.polynomial.chebyshev.cheb2poly(np.eye(nodes)[k]) for k in range(nodes)]
-    to_powers = sum(np.outer(np.pad(p, (0, nodes - len(p))), to_chebyshev[k]) for k, p in enumerate(series))
+    to_powers = np.stack([np.pad(p, (0, nodes - len(p))) for p in series], axis=1) @ to_chebyshev
     return to_powers, to_chebyshev[-4:]

@@ -115,7 +115,7 @@ def found(field: Callable, seen: Window, how: Integration, begin, final, y, stop
 
     def rates(at: _Step, y, dense):
         """`dy/du` at a step's ends times its length, which most solvers know."""
-        if isinstance(solver, dfx.AbstractRungeKutta) and solver.tableau.fsal:
+        if isinstance(tableau := getattr(solver, "tableau", None), dfx.ButcherTableau) and tableau.fsal:
             return dense["k"][0], dense["k"][-1]
         ends = field(at.begin, at.y, at.row), field(at.end, y, at.row)
         return tuple((at.end - at.begin) * rate for rate in ends)
