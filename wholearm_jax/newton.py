@@ -1,7 +1,7 @@
 r"""Newton's method along a wire: the place where the constraints hold and a function of the wire vanishes.
 
-With `K = [G; u]^-1`, of which the last column is `x = dz/ds` in the chart with direction `u` and the others bring `z`
-back to the constraints, each step is
+With `[K x] = [G; u]^-1`, where `x = dz/ds` in the chart with direction `u` and `K` brings `z` back to the constraints,
+each step is
 
     z <- z - K C(z) - x f / f',      f' = df/ds along x and x' = d2z/ds2
 
