@@ -1,4 +1,4 @@
-"""Newton's method along a wire, against a general method on the same equations, differences and closed forms."""
+"""Newton's method along a wire, against a general method on the same equations, and its differences."""
 
 import equinox as eqx
 import jax

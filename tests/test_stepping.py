@@ -62,7 +62,7 @@ def test_the_first_step_that_comes_past_is_the_last():
 
 
 def test_steps_that_may_have_been_past_are_taken_by_halves():
-    """And no others: those that follow grow again, to be halved again."""
+    """Those that follow grow again, to be halved again."""
     knots = [0.0, 1.0]
     (free, *_), (held, *_) = steps_of(knots, tolerance=1e-4), steps_of(knots, tolerance=1e-4, longest=0.1)
     widths = [np.diff(np.append(0.0, s.end[: int(s.count)])) for s in (free, held)]
@@ -119,11 +119,6 @@ def spring_of(stiffness, seen):
     return lambda share, y, row: jnp.stack([y[1], -stiffness * y[0]])
 
 
-def never(limit):
-    """Nothing ends the steps."""
-    return stop_at(limit)
-
-
 def test_steps_are_gone_back_over():
     """From their end to a state, a parameter and the time of their beginning; modes that it would get wrong raise."""
     steps, seen, _, y = steps_of([0.0, 0.4, 1.0], tolerance=1e-12)
@@ -132,7 +127,7 @@ def test_steps_are_gone_back_over():
     def end(y, stiffness=9.0, begin=0.0):
         inputs = jnp.asarray(stiffness), seen, jnp.asarray(begin), y
         one = jnp.ones(())
-        found = reversible(inputs, spring_of, never, how, one, -10 * one, one)
+        found = reversible(inputs, spring_of, stop_at, how, one, -10 * one, one)
         return found.y[found.count - 1]
 
     np.testing.assert_array_equal(end(y), steps.y[steps.count - 1])

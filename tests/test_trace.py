@@ -242,7 +242,7 @@ def traced_with(scene, phase, panels):
 
 
 def test_tables_are_refined_until_they_are_good_enough_or_refused():
-    """A wire on which friction nearly wedges the object has functions that no number of panels serves."""
+    """A wire on which friction nearly wedges the object has functions that 512 panels do not serve."""
     scene, few = wa.load("heptagon"), Resolution(panels=8)
     panels = {}
     for tolerance in (1e-4, 1e-9):

@@ -1,6 +1,6 @@
 """Differentiable dynamics and torque-trajectory optimisation for planar whole-arm manipulation.
 
-Read the modules in this order: `scene`, `contacts`, `system`, `march`, `start`, `places` and `wire` (trace),
+Read the modules in this order: `scene`, `contacts`, `system`, `newton`, `march`, `start`, `places` and `wire` (trace),
 `reduction` (reduce), `schedule`, `stepping`, `landing` and `motion` (simulate), `forces` (score), `verdict`, `phase`,
 `result` and `plan`, `squeeze` (quasi-static torques and the bound), `shooting`, `linearisation`, `condensing`,
 `descent`, `pacing`, `guesses` and `optimiser` (optimise), `baseline` (the paper's search), `variation` and `batch`

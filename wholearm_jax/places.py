@@ -75,8 +75,8 @@ def _vanishing(system, heading, marched, z, x, ahead_of_guess):
     several = jax.tree.map(lambda a, b: jnp.append(a, pick(b, made)[None], axis=0), system.contacts, system.candidates)
     at = frames(several, z)
     room = [(at.along - several.lower)[:slots], (several.upper - at.along)[:slots]]
-    coordinate = heading.until_value - pick(z, jnp.maximum(heading.until_coordinate, 0))
-    others = jnp.concatenate([*room, coordinate[None]])
+    ahead = heading.until_value - pick(z, jnp.maximum(heading.until_coordinate, 0))
+    others = jnp.concatenate([*room, ahead[None]])
     ending = jnp.where(marched.end < pairs, at.gap[slots], pick(others, jnp.maximum(marched.end - pairs, 0)))
     ending = jnp.where(marched.end < 0, ahead_of_guess, ending)
     return jnp.concatenate([slips_at(several, at, x)[:slots], x[3:], jnp.stack([ahead_of_guess, ending])])

@@ -113,23 +113,15 @@ def found(field: Callable, seen: Window, how: Integration, begin, final, y, stop
         knot = jnp.minimum(jnp.where(number < seen.last, pick(seen.share, number + 1), final), final)
         return jnp.where(begin + size > knot - 100 * eps, knot, begin + size)
 
-    def rates(at: _Step, y, dense):
-        """`dy/du` at a step's ends times its length, which most solvers know."""
-        if isinstance(tableau := getattr(solver, "tableau", None), dfx.ButcherTableau) and tableau.fsal:
-            return dense["k"][0], dense["k"][-1]
-        ends = field(at.begin, at.y, at.row), field(at.end, y, at.row)
-        return tuple((at.end - at.begin) * rate for rate in ends)
-
     def attempt(at: _Step) -> _Step:
         y, miss, dense, reused, _ = solver.step(term, at.begin, at.end, at.y, at.row, at.reused, at.jumped)
         error = jnp.asarray(miss)
         error = jnp.where(jnp.isnan(error), jnp.inf, error)
         kept, *span, _, control, _ = errors.adapt_step_size(at.begin, at.end, at.y, y, None, error, order, at.control)
-        halved = kept & stop.between(at.y, y, rates(at, y, dense), at.end - at.begin)
+        halved = kept & stop.between(at.y, y, _rates(solver, field, at, y, dense), at.end - at.begin)
         kept = kept & ~halved
-        control = jax.tree.map(lambda old, new: jnp.where(halved, old, new), at.control, control)
-        begin, end = (jnp.asarray(share) for share in span)
-        begin, end = jnp.where(halved, at.begin, begin), jnp.where(halved, (at.begin + at.end) / 2, end)
+        shorter = at.begin, (at.begin + at.end) / 2, at.control
+        begin, end, control = jax.tree.map(lambda a, b: jnp.where(halved, a, b), shorter, (*span, control))
         # What a knot cut short says nothing against the length that was meant.
         size = jnp.where(kept, jnp.maximum(end - begin, at.size), end - begin)
         row = interval(seen, begin)
@@ -165,6 +157,14 @@ def found(field: Callable, seen: Window, how: Integration, begin, final, y, stop
     start = _Step(begin, end, size, row, y, jumped, reused, control, jnp.asarray(0, int), none)
     last = jax.lax.while_loop(going, attempt, start)
     return last.steps._replace(complete=(last.begin >= final) | last.steps.passed)
+
+
+def _rates(solver: dfx.AbstractSolver, field: Callable, at: _Step, y, dense):
+    """`dy/du` at a step's ends times its length, which most solvers know."""
+    if isinstance(tableau := getattr(solver, "tableau", None), dfx.ButcherTableau) and tableau.fsal:
+        return dense["k"][0], dense["k"][-1]
+    ends = field(at.begin, at.y, at.row), field(at.end, y, at.row)
+    return tuple((at.end - at.begin) * rate for rate in ends)
 
 
 def repeated(field: Callable, seen: Window, how: Integration, begin, final, y, steps: Steps) -> Steps:
