@@ -2,6 +2,7 @@
 
 import inspect
 import sys
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -12,10 +13,12 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax import batch_command, command
 from wholearm_jax import survey as survey_module
-from wholearm_jax.batch import Checked, check_chunks, from_result
+from wholearm_jax.batch import QUICK, Checked, check_chunks, check_scene, from_result
 from wholearm_jax.outline import first_flaw
 from wholearm_jax.polygon_file import read_polygons
 from wholearm_jax.scene_file import SceneError, to_dict
+from wholearm_jax.schedule import Torque, padded
+from wholearm_jax.status import Status
 from wholearm_jax.store import StoreError, fingerprint, identity, open_store
 from wholearm_jax.survey import influences, survey
 from wholearm_jax.variation import stack, vary
@@ -91,6 +94,19 @@ def test_a_scene_that_cannot_be_followed_disturbs_no_other(drawn, schedule, chec
     for row in (0, 2):
         assert mixed.margin[row] == pytest.approx(checked.margin[row], rel=1e-9)
         assert mixed.status[row] == checked.status[row]
+
+
+def test_what_follows_a_failure_must_be_known_as_well(scene, schedule):
+    """Its margin counts: a table that is too coarse there is refined, though the status is that of the phase before."""
+    bent = jnp.where((schedule.times < 0.5)[:, None], -schedule.values, schedule.values)
+    torque = padded(Torque(schedule.times, bent))
+    errors = [float(one.table.error) for one in wa.trace(scene, resolution=QUICK.resolution, tolerance=1.0)]
+    assert errors[0] < errors[1]
+    for limit, enough in ((np.sqrt(errors[0] * errors[1]), False), (2 * errors[1], True)):
+        answer, good = jax.jit(partial(check_scene, level=QUICK._replace(error=limit)))(scene, torque, ARRIVAL)
+        assert int(answer.status) != Status.OK
+        assert int(answer.phase) == 0
+        assert bool(good) is enough
 
 
 def test_a_draw_depends_on_its_number_alone(scene, ensemble):

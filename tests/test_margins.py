@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.plan import least, outcomes, roomy
+from wholearm_jax.plan import least, outcomes, roomy, steps_within
 from wholearm_jax.scene import replace_duration
 from wholearm_jax.scene_file import to_dict
 from wholearm_jax.stepping import Integration, with_room
@@ -66,6 +66,22 @@ def test_a_step_of_torque_between_phases_may_stand_beside_their_seam_by_rounding
     again = wa.simulate(plan, rounded)
     assert again.status is wa.Status.OK, again.message
     assert again.margin == pytest.approx(found.result.margin, rel=1e-6)
+
+
+def test_a_seam_between_phases_is_no_step_within_one(heptagon):
+    """The end of a phase less its duration is its beginning but for rounding."""
+    scene, _ = heptagon
+    first, second = 0.2516761376302456, 10.0
+    assert (first + second) - second < first, "what is shown here needs such a pair"
+    phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, (first, second), strict=True))
+    scene = eqx.tree_at(lambda s: s.phases, scene, phases)
+
+    def stepping_at(time):
+        return wa.torque([0.0, time, time, first + second], np.zeros((4, 2)))
+
+    assert not steps_within(scene, stepping_at(first))
+    assert steps_within(scene, stepping_at(0.99 * first))
+    assert steps_within(scene, stepping_at(1.01 * first))
 
 
 def test_durations_that_are_one_are_kept_and_those_in_no_order_refused(heptagon):

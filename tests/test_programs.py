@@ -1,5 +1,7 @@
 """Kept programs: read instead of traced, equal to traced ones, never mistaken for others, never in the way."""
 
+import threading
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -117,3 +119,31 @@ def test_what_cannot_be_named_is_not_kept(folder):
     for method in (optax.scale(factor), own):
         assert float(programs.Program(apply)(method, jnp.asarray(3.0))) == 21.0
     assert not list(folder.iterdir())
+
+
+def test_what_is_put_beside_is_called_once_for_each_kind_after_the_next_program_is_traced(monkeypatch):
+    monkeypatch.setattr(programs, "_calls_beside", {})
+    called = []
+
+    def note(number, array):
+        called.append((number, array.shape, threading.current_thread()))
+
+    calls = [programs.beside(note, number, jnp.zeros(size)) for number, size in ((1, 2), (2, 2), (1, 2), (1, 3))]
+    assert calls[0] is calls[2]
+    assert not called
+    TRACED.clear()
+    call(power=7)
+    for one in calls:
+        one.wait()
+    assert [(number, shape) for number, shape, _ in called] == [(1, (2,)), (2, (2,)), (1, (3,))]
+    assert all(thread is not threading.current_thread() for *_, thread in called)
+
+
+def test_who_waits_for_what_is_beside_is_told_what_it_raised(monkeypatch):
+    monkeypatch.setattr(programs, "_calls_beside", {})
+
+    def fail():
+        raise ValueError("it cannot be compiled")
+
+    with pytest.raises(ValueError, match="cannot be compiled"):
+        programs.beside(fail).wait()

@@ -17,12 +17,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from wholearm_jax.phase import Traced, run
+from wholearm_jax.phase import Traced, run, run_blank
 from wholearm_jax.plan import require_motion, simulate, trace
+from wholearm_jax.programs import Beside, beside
 from wholearm_jax.requirements import require_x64
 from wholearm_jax.result import Result
 from wholearm_jax.scene import Phase, Scene, replace_duration
-from wholearm_jax.schedule import Torque, padded
+from wholearm_jax.schedule import Torque, padded, rounded
 from wholearm_jax.squeeze import coefficients, hold
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
@@ -43,11 +44,11 @@ class Searched:
     seconds: float
 
 
-def search(scene: Scene, *, longest: float = 10.0) -> Searched:
+def search(scene: Scene, *, longest: float = 10.0, traced: tuple[Traced, ...] = ()) -> Searched:
     """Search each phase's torques by steps of 10 %; no phase may take longer than `longest` seconds.
 
     A phase for which no raise works keeps the attempt with the largest margin, and the result's status says what it
-    does. Raises ValueError for a plan with a phase that holds the object.
+    does. `traced` reuses the result of `trace`. Raises ValueError for a plan with a phase that holds the object.
 
     The paper's section 3.1 (derivation, section 10). Raises RuntimeError without float64.
 
@@ -58,7 +59,10 @@ def search(scene: Scene, *, longest: float = 10.0) -> Searched:
     require_x64()
     require_motion(scene)
     begun = time.perf_counter()
-    traced = trace(scene)
+    if not traced:
+        compiled = search_beside()
+        traced = trace(scene)
+        compiled.wait()
     phases, times, rows, start, count = [], [], [], 0.0, 0
     for phase, at in zip(scene.phases, traced, strict=True):
         torque, duration, tried = _search_phase(at, longest)
@@ -71,6 +75,11 @@ def search(scene: Scene, *, longest: float = 10.0) -> Searched:
     schedule = Torque(jnp.asarray(times), jnp.asarray(np.array(rows)))
     result = simulate(found, schedule, traced=traced)
     return Searched(found, schedule, result, count + len(phases), time.perf_counter() - begun)
+
+
+def search_beside() -> Beside:
+    """Compile what `search` runs in a thread of its own, while wires are traced; it is to be waited for."""
+    return beside(run_blank, rounded(2), Integration())
 
 
 def _arriving(phase: Phase) -> Phase:

@@ -1,6 +1,7 @@
 """Check: one torque schedule against very many scenes, each traced, reduced, simulated, scored and judged.
 
-The plan of one scene is a scan over its phases. A CPU does a block of scenes one after the other, each with loops that
+Two programs, compiled side by side, serve all scenes: one traces and tabulates the wires of a plan, the other simulates
+it on the tables; each is a scan over its phases. A CPU does a block of scenes one after the other, each with loops that
 do what it needs and no more; a GPU does them side by side (`jax.vmap`), as does a CPU where all have the same wires,
 which are then traced once a block. Where there are several devices `shard_map` gives each its own block. A chunk is a
 number of blocks. The first pass is coarse (`QUICK`): few panels, fewer steps. It knows its error; scenes for which that
@@ -17,10 +18,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.phase import Outcome, Traced, final_configuration
+from wholearm_jax.phase import Outcome, final_configuration
 from wholearm_jax.plan import (
     require_covered,
     require_motion,
@@ -30,14 +31,13 @@ from wholearm_jax.plan import (
     simulate_told,
     stacked,
     steps_within,
-    trace_first,
-    trace_next,
-    trace_told,
+    traced_together,
 )
-from wholearm_jax.programs import Program
+from wholearm_jax.programs import Program, beside
+from wholearm_jax.reduction import Table, blank
 from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result
-from wholearm_jax.scene import Formation, Scene, body
+from wholearm_jax.scene import Formation, Scene
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
@@ -231,54 +231,79 @@ def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):
 
 def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Level, mesh: Mesh):
     """Check `BLOCK` scenes a device."""
-    if mesh.size == 1:
-        return _check_here(source, numbers, schedule, arrival, level, _beside(source, mesh))
-    return _check_apart(source, numbers, schedule, arrival, level, mesh)
+    side_by_side = source.same_wires or mesh.devices.flat[0].platform != "cpu"
+    told = source, schedule, arrival, level, side_by_side
+    compiled = beside(_on, mesh, _checks_of, told, numbers, _blank_tables(source, level, mesh))
+    tables = _on(mesh, _tables_of, (source, level, side_by_side), numbers)
+    compiled.wait()
+    return _on(mesh, _checks_of, told, numbers, tables)
 
 
-def _beside(source: Source, mesh: Mesh) -> bool:
-    """Whether a device of a mesh should work on scenes side by side."""
-    return source.same_wires or mesh.devices.flat[0].platform != "cpu"
+def _blank_tables(source: Source, level: Level, mesh: Mesh) -> Table:
+    """Tables without wires for a block of scenes, where those that have them will be."""
+    shape = BLOCK * mesh.size, len(source.nominal.phases)
+    tables = jax.tree.map(lambda a: np.broadcast_to(a, (*shape, *a.shape)), blank(level.resolution))
+    return tables if mesh.size == 1 else jax.device_put(tables, NamedSharding(mesh, PartitionSpec("scenes")))
 
 
-@Program
-def _check_here(source: Source, numbers, schedule: Torque, arrival, level: Level, beside: bool):
-    """Check scenes on one device, one after the other or side by side."""
-
-    def one(number):
-        return check_scene(source.draw(number), schedule, arrival, level)
-
-    return jax.vmap(one)(numbers) if beside else jax.lax.map(one, numbers)
+def _on(mesh: Mesh, program: Program, told: tuple, *each):
+    """Call a program on all devices, with what all are `told` and what is `each` one's own."""
+    return program(told, *each) if mesh.size == 1 else _apart(mesh, program, told, *each)
 
 
 @eqx.filter_jit
-def _check_apart(source: Source, numbers, schedule: Torque, arrival, level: Level, mesh: Mesh):
-    """Check scenes on several devices, each with loops of its own."""
-    arrays, static = eqx.partition(source, eqx.is_array)
+def _apart(mesh: Mesh, program: Program, told: tuple, *each):
+    arrays, static = eqx.partition(told, eqx.is_array)
 
-    def local(arrays, numbers, schedule, arrival):
-        source = eqx.combine(arrays, static)
-        return _check_here(source, numbers, schedule, arrival, level, _beside(source, mesh))
+    def local(arrays, *each):
+        return program(eqx.combine(arrays, static), *each)
 
-    each, whole = PartitionSpec("scenes"), PartitionSpec()
-    mapped = jax.shard_map(local, mesh=mesh, in_specs=(whole, each, whole, whole), out_specs=each, check_vma=False)
-    return mapped(arrays, numbers, schedule, arrival)
+    own, whole = PartitionSpec("scenes"), PartitionSpec()
+    specs = (whole, *(own for _ in each))
+    return jax.shard_map(local, mesh=mesh, in_specs=specs, out_specs=own, check_vma=False)(arrays, *each)
+
+
+@Program
+def _tables_of(told, numbers):
+    """The tables of scenes' wires, scenes one after the other or side by side."""
+    source, level, side_by_side = told
+
+    def one(number):
+        return traced_together(source.draw(number), level.resolution).table
+
+    return jax.vmap(one)(numbers) if side_by_side else jax.lax.map(one, numbers)
+
+
+@Program
+def _checks_of(told, numbers, tables):
+    """Check scenes on their tables."""
+    source, schedule, arrival, level, side_by_side = told
+
+    def one(scene):
+        number, tables = scene
+        return check_tables(source.draw(number), tables, schedule, arrival, level)
+
+    scenes = numbers, tables
+    return jax.vmap(one)(scenes) if side_by_side else jax.lax.map(one, scenes)
 
 
 def check_scene(scene: Scene, schedule: Torque, arrival, level: Level) -> tuple[Checked, Bool[Array, ""]]:
     """Check one scene (under any transformation), and say whether this level's result is good enough."""
-    solid = body(scene.object)
+    return check_tables(scene, traced_together(scene, level.resolution).table, schedule, arrival, level)
 
-    def one(at, phase):
-        place, clock = at
-        wire, motion, formation = phase
-        place, traced = trace_next(scene, solid, level.resolution, place, wire)
-        clock, done = simulate_next(schedule, level.how, arrival, clock, (traced.table, *motion))
-        return (place, clock), _stop(traced, done, formation, level)
 
-    begin = trace_first(scene), simulate_first(schedule)
-    phases = stacked([(trace_told(p), simulate_told(p), p.formation) for p in scene.phases])
-    _, stops = jax.lax.scan(one, begin, phases)
+def check_tables(
+    scene: Scene, tables: Table, schedule: Torque, arrival, level: Level
+) -> tuple[Checked, Bool[Array, ""]]:
+    """Check one scene on the tables of its wires."""
+
+    def one(clock, phase):
+        table, motion, formation = phase
+        clock, done = simulate_next(schedule, level.how, arrival, clock, (table, *motion))
+        return clock, _stop(table, done, formation, level)
+
+    told = stacked([(simulate_told(p), p.formation) for p in scene.phases])
+    _, stops = jax.lax.scan(one, simulate_first(schedule), (tables, *told))
     failed = stops.status != int(Status.OK)
     where = jnp.where(failed.any(), jnp.argmax(failed), jnp.argmin(stops.margin))
     last = jnp.where(failed.any(), where, len(scene.phases) - 1)
@@ -296,9 +321,9 @@ def check_scene(scene: Scene, schedule: Torque, arrival, level: Level) -> tuple[
     return answer, jnp.all(stops.good | ~needed)
 
 
-def _stop(traced: Traced, done: Outcome, formation: Formation, level: Level) -> _Stop:
+def _stop(table: Table, done: Outcome, formation: Formation, level: Level) -> _Stop:
     """One phase's result, and whether it is to be trusted: a fine table, and neither steps nor pieces used up."""
-    table, motion = traced.table, done.motion
+    motion = done.motion
     known = jnp.isfinite(done.score.margin) & (table.status == 0)
     of_slot = jnp.cumsum(~formation.tangential) - 1
     status, contact = done.verdict.status, done.verdict.contact

@@ -171,11 +171,14 @@ def simulate(
     """Simulate a plan under a given torque schedule."""
     loaded = scene_of(scene, set_)
     from wholearm_jax.optimiser import bounds
+    from wholearm_jax.plan import simulate_beside
     from wholearm_jax.result_file import read_torque
 
     schedule = read_torque(torque)
     folder = made_folder(out)
+    compiled = simulate_beside(loaded, schedule, tolerance)
     traced = traced_or_refused(scene, loaded)
+    compiled.wait()
     result = predicted(loaded, schedule, torque, tolerance, traced)
     _tell(result)
     if check_gradient:
@@ -267,11 +270,14 @@ def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
     loaded = scene_of(scene, None)
     folder = made_folder(out)
     from wholearm_jax.baseline import search as look
+    from wholearm_jax.baseline import search_beside
     from wholearm_jax.optimiser import bounds
 
+    compiled = search_beside()
     traced = traced_or_refused(scene, loaded)
+    compiled.wait()
     try:
-        found = look(loaded)
+        found = look(loaded, traced=traced)
     except ValueError as error:
         raise BadInput(f"{scene}: {error}") from None
     _tell(found.result)

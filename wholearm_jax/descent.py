@@ -35,7 +35,7 @@ from wholearm_jax.forces import smooth_margin
 from wholearm_jax.linearisation import Limits, Linear, change_of_rooms, gather, linearise, sizes
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Table
-from wholearm_jax.shooting import PACES, PARTS, ROWS, SAMPLES, STEPS, Variables
+from wholearm_jax.shooting import PACES, PARTS, ROWS, Variables, samples_of
 from wholearm_jax.squeeze import coefficients
 from wholearm_jax.stepping import Integration
 
@@ -71,7 +71,7 @@ def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
 
     def init(params):
         knots = (params.shape[0] // phases - 1) // 4
-        shape = (phases, knots - 1, PARTS * STEPS * (SAMPLES * ROWS + PACES) + 8 + 4 + 2)
+        shape = (phases, knots - 1, PARTS * (samples_of(knots - 1) * ROWS + PACES) + 8 + 4 + 2)
         level, hot, cold = (jnp.full((), value) for value in (jnp.nan, HOTTEST, COLDEST))
         return Duals(jnp.ones(shape), jnp.zeros(shape), level, hot, cold, jnp.zeros(2), jnp.zeros(()))
 

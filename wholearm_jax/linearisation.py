@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.forces import spare
 from wholearm_jax.reduction import Table, change, on_panel, powers
-from wholearm_jax.shooting import PARTS, ROWS, SAMPLES, STEPS, Shot, Variables, local, shoot
+from wholearm_jax.shooting import PARTS, ROWS, Shot, Variables, local, samples_of, shoot
 from wholearm_jax.stepping import Integration
 
 
@@ -111,7 +111,7 @@ def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> 
     def seams(x):
         return _seams(unravel(x), tables)
 
-    bears = np.arange(at.room.shape[2]) < PARTS * STEPS * SAMPLES * ROWS
+    bears = np.arange(at.room.shape[2]) < PARTS * samples_of(knots - 1) * ROWS
     return Linear(
         at,
         rates,

@@ -6,10 +6,8 @@ It starts from the quasi-static torques of a smooth motion, descends (`pacing`) 
 margin falls, and keeps the best schedule whose honest simulation succeeds.
 """
 
-import functools
 import itertools
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -23,15 +21,15 @@ from wholearm_jax.guesses import guesses
 from wholearm_jax.handover import Handover, handovers, steady
 from wholearm_jax.linearisation import Limits
 from wholearm_jax.pacing import HOW, Step
-from wholearm_jax.phase import Traced, balance_at_start, run
+from wholearm_jax.phase import Traced, balance_at_start, run_blank
 from wholearm_jax.plan import outcomes, trace
 from wholearm_jax.precision import array
-from wholearm_jax.programs import Program
+from wholearm_jax.programs import Beside, Program, beside
 from wholearm_jax.reduction import blank
 from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result, describe
 from wholearm_jax.scene import Scene, replace_duration
-from wholearm_jax.schedule import Torque, evenly, in_turn, padded, rounded
+from wholearm_jax.schedule import Torque, evenly, in_turn, rounded
 from wholearm_jax.shooting import Variables
 from wholearm_jax.squeeze import Bound, bound
 from wholearm_jax.status import Status
@@ -154,12 +152,11 @@ def optimise(
         raise ValueError("durations are (shortest, longest), positive and in this order")
     if durations is not None and durations[0] == durations[1]:
         scene, durations = _lasting(scene, durations[0]), None
-    ready = compile_ahead(scene, knots=knots, optimiser=optimiser)
+    compiled = compile_ahead(scene, knots=knots, optimiser=optimiser)
     traced = traced or trace(scene)
     tops = bounds(scene, traced=traced)
-    for one in ready:
-        one.result()
-    wanted = Wanted(knots, _rows(scene, knots), steps, rate_limit, durations, passing, optimiser, tolerance, callback)
+    rows = _rows(scene, knots)
+    wanted = Wanted(knots, rows, steps, rate_limit, durations, passing, optimiser, tolerance, callback, compiled)
     found = []
     for lead in LEADS if rate_limit is not None else LEADS[:1]:
         found.append(_attempt(scene, traced, tops, wanted, lead))
@@ -207,11 +204,11 @@ def _lasting(scene: Scene, duration: float) -> Scene:
 
 def compile_ahead(
     scene: Scene, *, knots: int = 51, optimiser: optax.GradientTransformation | None = None
-) -> list[Future[None]]:
-    """Begin to compile the programs of `optimise` in threads of their own, as can be done while wires are traced."""
+) -> list[Beside]:
+    """Begin to compile the programs of `optimise` in a thread of its own, as can be done while wires are traced."""
     rows = _rows(scene, knots)
     sizes = {len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"}
-    return [_ahead(n, knots, rows, descent_method(optimiser, n)) for n in sorted(sizes)]
+    return [beside(_compile, n, knots, rows, descent_method(optimiser, n)) for n in sorted(sizes)]
 
 
 def _rows(scene: Scene, knots: int) -> int:
@@ -228,14 +225,6 @@ def _groups(scene: Scene) -> list[list[int]]:
     return groups
 
 
-@functools.cache
-def _ahead(phases: int, knots: int, rows: int, method) -> Future[None]:
-    beside = ThreadPoolExecutor(1)
-    future = beside.submit(_compile, phases, knots, rows, method)
-    beside.shutdown(wait=False)  # the thread ends when it has done this
-    return future
-
-
 def _compile(phases: int, knots: int, rows: int, method) -> None:
     """Run the descent's programs once, on blank tables."""
     table = blank(Resolution())
@@ -246,8 +235,7 @@ def _compile(phases: int, knots: int, rows: int, method) -> None:
     empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
     p = Variables(*(array(a) for a in empty))
     advance(begin(p, method), tables, limits, HOW, method)
-    zero, one = array(0.0), array(1.0)
-    run(table, padded(evenly(1.0, empty[0][0]), rows), zero, one, with_room(Integration(), knots), "rest")
+    run_blank(rows, with_room(Integration(), knots))
 
 
 _bound = Program(bound)

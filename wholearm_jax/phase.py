@@ -15,11 +15,11 @@ from wholearm_jax.contacts import GROUPS, PALM_END, ROOT
 from wholearm_jax.forces import Score, score
 from wholearm_jax.holding import Departure, Statics, statics
 from wholearm_jax.motion import Motion, move
-from wholearm_jax.precision import given
+from wholearm_jax.precision import array, given
 from wholearm_jax.programs import Program
-from wholearm_jax.reduction import Change, Table, change, on_panel, powers, reduce_wire
+from wholearm_jax.reduction import Change, Table, blank, change, on_panel, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, contact_name
-from wholearm_jax.schedule import Torque, window
+from wholearm_jax.schedule import Torque, evenly, padded, window
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration, tolerance_as_data
 from wholearm_jax.system import system
@@ -91,6 +91,12 @@ def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integra
     panel, xi = powers(table, motion.piece[last], motion.s[motion.count])
     leaving = on_panel(table.velocity, panel, xi) * motion.w[motion.count] / duration
     return Outcome(start, duration, entered, motion, scored, verdict, leaving)
+
+
+def run_blank(rows: int, how: Integration) -> None:
+    """Run a phase under a schedule of so many rows, on a table of the usual size that has no wire: that compiles what
+    runs those that have one (`programs.beside`)."""
+    run(blank(Resolution()), padded(evenly(1.0, np.zeros((rows, 2)))), array(0.0), array(1.0), how, "rest")
 
 
 @jax.jit

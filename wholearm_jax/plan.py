@@ -22,14 +22,15 @@ from wholearm_jax.phase import (
     end_configuration,
     prepare,
     run,
+    run_blank,
     start_configuration,
 )
 from wholearm_jax.precision import array, digits
-from wholearm_jax.programs import transformed
+from wholearm_jax.programs import Beside, beside, transformed
 from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result, describe
 from wholearm_jax.scene import Body, Phase, Scene, body
-from wholearm_jax.schedule import Torque, has_steps, padded
+from wholearm_jax.schedule import Torque, has_steps, padded, rounded
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration, tolerance_as_data, with_room
 from wholearm_jax.verdict import ARRIVAL, GOALS
@@ -55,7 +56,7 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     1.33 object radii
     """
     if transformed(scene):  # shapes are fixed there: the caller has chosen the resolution
-        return _apart(_traced_together(scene, resolution), len(scene.phases))
+        return _apart(traced_together(scene, resolution), len(scene.phases))
     solid, rough, found = body(scene.object), scene.start, []
     for phase in scene.phases:
         traced = _refined(solid, scene, phase, rough, resolution, tolerance)
@@ -68,7 +69,7 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
 
 
 @eqx.filter_jit
-def _traced_together(scene: Scene, resolution: Resolution) -> Traced:
+def traced_together(scene: Scene, resolution: Resolution) -> Traced:
     """Every phase of a plan in one program: `Traced` with an axis of phases."""
     on = partial(trace_next, scene, body(scene.object), resolution)
     return jax.lax.scan(on, trace_first(scene), stacked([trace_told(p) for p in scene.phases]))[1]
@@ -269,16 +270,27 @@ def simulate(
     require_x64()
     require_positive(tolerance=tolerance, max_steps=max_steps, arrival=arrival)
     require_covered(scene, torque)
-    traced = traced or trace(scene)
-    stepped = steps_within(scene, torque)
+    if not traced:
+        compiled = simulate_beside(scene, torque, tolerance, max_steps)
+        traced = trace(scene)
+        compiled.wait()
     while True:
-        how = Integration(tolerance=tolerance, max_steps=max_steps, stages=max(8, max_steps // 32), steps=stepped)
-        how = roomy(how, scene, torque)
-        found = outcomes(scene, torque, traced, how, arrival)
+        found = outcomes(scene, torque, traced, _integration(scene, torque, tolerance, max_steps), arrival)
         short = any(int(o.verdict.status) == Status.MAX_STEPS for o in found)
         if not short or max_steps >= 16384:
             return describe(scene, torque, traced, found)
         max_steps *= 4
+
+
+def simulate_beside(scene: Scene, torque: Torque, tolerance: float = 1e-10, max_steps: int = 256) -> Beside:
+    """Compile what `simulate` runs in a thread of its own, while wires are traced; it is to be waited for."""
+    return beside(run_blank, rounded(len(torque.times)), _integration(scene, torque, tolerance, max_steps))
+
+
+def _integration(scene: Scene, torque: Torque, tolerance: float, max_steps: int) -> Integration:
+    """How `simulate` integrates."""
+    stages, steps = max(8, max_steps // 32), steps_within(scene, torque)
+    return roomy(Integration(tolerance=tolerance, max_steps=max_steps, stages=stages, steps=steps), scene, torque)
 
 
 def roomy(how: Integration, scene: Scene, torque: Torque) -> Integration:

@@ -5,6 +5,9 @@ JAX's own cache of compiled programs spares compiling, but not tracing Python in
 milliseconds, and finds what it compiles to in JAX's cache. A file's name is the digest of everything that decides what
 the program is: the package's source, the versions of what it is written with, the function, its static arguments, and
 the shapes of its arrays. What cannot be named so (a function that closes over objects) is traced anew in each process.
+
+Python traces one program at a time, whatever the number of threads, but XLA compiles several: what will be wanted is
+compiled `beside`, as soon as the first program has been traced.
 """
 
 import contextlib
@@ -12,8 +15,10 @@ import functools
 import hashlib
 import os
 import pickle
+import threading
 import types
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -54,13 +59,19 @@ class Program:
         leaves, tree = jax.tree.flatten(args)
         arrays = [leaf for leaf in leaves if isinstance(leaf, ARRAYS)]
         settings = tuple([None if isinstance(leaf, ARRAYS) else (type(leaf), leaf) for leaf in leaves])
-        folder = None if transformed(arrays) else _folder
+        within = transformed(arrays)  # another program
+        folder = None if within else _folder
         shapes = folder and tuple([(array.shape, array.dtype) for array in arrays])
         key = tree, settings, folder, shapes
         call = self._calls.get(key)
         if call is None:
             kept = self._kept(folder, arrays, tree, settings) if folder else None
-            call = self._calls[key] = kept or jax.jit(self._of_arrays(tree, settings))
+            call = jax.jit(self._of_arrays(tree, settings))
+            if not (within or kept):
+                call.trace(*arrays).lower()  # all that needs Python: calling it compiles it
+            if not within:
+                _start()
+            call = self._calls[key] = _compiled(*kept) if kept else call
         return call(*arrays)
 
     def sizes(self) -> int:
@@ -78,8 +89,9 @@ class Program:
         flat.__name__ = self._name
         return flat
 
-    def _kept(self, folder: Path, arrays, tree, settings) -> Callable | None:
-        """The kept program for arguments of one kind: read, or traced and written; None where none can be named."""
+    def _kept(self, folder: Path, arrays, tree, settings):
+        """The kept program for arguments of one kind, lowered, and its result's structure: read, or traced and written.
+        None where none can be named."""
         own = [_identity(setting[1]) for setting in settings if setting is not None]
         names = [self._function.__module__, self._name, str(tree), *own]
         shapes = str([(array.shape, array.dtype) for array in arrays])
@@ -89,12 +101,12 @@ class Program:
         path = folder / f"{self._name}-{hashlib.sha256(named.encode()).hexdigest()}"
         with contextlib.suppress(Exception):  # a file of any kind that cannot be read is written anew
             shape, program = pickle.loads(path.read_bytes())
-            return _callable(export.deserialize(program), shape)
+            return _lowered(export.deserialize(program), shape)
         program, shape = self._exported(arrays, tree, settings)
         with contextlib.suppress(OSError):  # a folder that cannot be written to: nothing is kept
             path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, pickle.dumps((shape, bytes(program.serialize()))))
-        return _callable(program, shape)
+        return _lowered(program, shape)
 
     def _exported(self, arrays, tree, settings):
         """The exported program, and its result's shape with the number of its array in every leaf."""
@@ -111,9 +123,61 @@ class Program:
         return export.export(jax.jit(flat))(*abstract), shape
 
 
-def _callable(program: export.Exported, shape) -> Callable:
-    # Compiled ahead: `jit` would compile again where a constant's type is weak.
-    compiled, structure = jax.jit(program.call).lower(*program.in_avals).compile(), jax.tree.structure(shape)
+class Beside:
+    """A call that is made in a thread of its own, for the programs that it compiles: what it returns is dropped."""
+
+    def __init__(self, function: Callable, args) -> None:
+        self._function, self._args, self._done = function, args, Future()
+
+    def make(self) -> None:
+        """Make it here and now."""
+        try:
+            self._function(*self._args)
+            self._done.set_result(None)
+        except BaseException as raised:  # told to who waits for it
+            self._done.set_exception(raised)
+
+    def wait(self) -> None:
+        """Wait until it is made; raises what it raised."""
+        _start()
+        self._done.result()
+
+
+def beside(function: Callable, *args) -> Beside:
+    """Call a function in a thread of its own, once for every kind of arguments: after what was put beside before, and
+    as soon as the next program has been traced, or one waits for it."""
+    leaves, tree = jax.tree.flatten(args)
+    kind = [(leaf.shape, leaf.dtype) if isinstance(leaf, ARRAYS) else (type(leaf), leaf) for leaf in leaves]
+    key = function, tree, tuple(kind)
+    if key not in _calls_beside:
+        _calls_beside[key] = Beside(function, args)
+        _waiting.append(_calls_beside[key])
+    return _calls_beside[key]
+
+
+def _start() -> None:
+    """Begin with what waits to be made."""
+    with _starting:
+        while _waiting:
+            _thread().submit(_waiting.pop(0).make)
+
+
+_calls_beside: dict[Any, Beside] = {}
+_waiting: list[Beside] = []
+_starting = threading.Lock()
+
+
+@functools.cache
+def _thread() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1)
+
+
+def _lowered(program: export.Exported, shape):
+    return jax.jit(program.call).lower(*program.in_avals), jax.tree.structure(shape)
+
+
+def _compiled(lowered, structure) -> Callable:
+    compiled = lowered.compile()  # ahead: `jit` would compile again where a constant's type is weak
     return lambda *arrays: jax.tree.unflatten(structure, compiled(*arrays))
 
 

@@ -74,10 +74,12 @@ def in_turn(schedules: list[Torque]) -> Torque:
 
 
 def has_steps(schedule: Torque, start: float, end: float) -> bool:
-    """Whether the schedule steps strictly between two times (a static choice for the integrator)."""
+    """Whether the schedule steps between two times (a static choice for the integrator); a step that lies at one of
+    them but for rounding does not count, as in `window`."""
     times = np.asarray(schedule.times)
     stepped = times[1:][np.diff(times) == 0]
-    return bool(np.any((stepped > start) & (stepped < end)))
+    near = ROUNDING * np.finfo(times.dtype).eps * (abs(start) + abs(end - start))
+    return bool(np.any((stepped > start + near) & (stepped < end - near)))
 
 
 def rounded(rows: int, multiple: int = ROWS) -> int:

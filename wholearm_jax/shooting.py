@@ -16,6 +16,7 @@ problems, IFAC World Congress 1984.
 Derivation: section 9 of `docs/derivation.md`.
 """
 
+import functools
 import math
 from functools import partial
 from typing import NamedTuple
@@ -34,11 +35,12 @@ from wholearm_jax.reduction import Table, derivative
 from wholearm_jax.schedule import Window
 from wholearm_jax.stepping import Integration
 
-STEPS = 2  # solver steps an interval (and a part of it, where it is cut)
+FINE = 50  # intervals of a phase from which one solver step in each serves; fewer take two
 ROWS = 4 + MOST_ROLLING  # slacks a sample
-SAMPLES = 5  # places in a step at which forces are sampled, its ends included
+SPACES = 8  # between the places of an interval at which forces are sampled
 PARTS = 3  # pieces of the wire that one interval may touch
-PACES = 4  # numbers a step that bound its speed from below
+HALF = 4  # numbers that bound the speed from below in half of an interval
+PACES = 2 * HALF
 LANDINGS = 30  # most Newton steps to the place where an interval is cut
 LANDED = 1e-8  # size of the last one; what is left is taken to first order, an error of its square
 
@@ -51,6 +53,16 @@ class Variables(eqx.Module):
     torque: Float[Array, "phases knots 2"]
     state: Float[Array, "phases knots 2"]
     log_duration: Float[Array, "phases"]
+
+
+def steps_of(intervals: int) -> int:
+    """Solver steps in each interval of a phase, and in each part of one that is cut."""
+    return 1 if intervals >= FINE else 2
+
+
+def samples_of(intervals: int) -> int:
+    """Forces sampled in each: evenly, both ends of every step included."""
+    return SPACES + steps_of(intervals)
 
 
 class Shot(NamedTuple):
@@ -132,7 +144,8 @@ def _one_part(table: Table, how: Integration, intervals: int, at: _Way, q: Float
     values, zero = q[2:6].reshape(2, 2) * table.torque_limit, jnp.zeros((), int)
     seen = Window(jnp.arange(2.0), values, values[1:] - values[:-1], zero, zero)
     duration = jnp.exp(q[6]) / intervals
-    when, place, onward = _to_break(table, seen, duration, how, at)
+    count, samples = steps_of(intervals), samples_of(intervals)
+    when, place, onward = _to_break(table, seen, duration, how, at, count)
     factor = table.factor[jnp.minimum(at.piece + 1, table.factor.shape[0] - 1)]
     after = _Way(
         share=jnp.where(onward, when[-1], 1.0),
@@ -141,9 +154,9 @@ def _one_part(table: Table, how: Integration, intervals: int, at: _Way, q: Float
         count=at.count + 1,
     )
     steps = _arcs(table, seen, duration, when, place, at.piece)
-    forces = sampled_slacks(table, seen, duration, steps, SAMPLES, linear_slacks).reshape(STEPS * SAMPLES, -1)
-    span = stop_gradient(when[-1] - when[0]) / (STEPS * intervals)
-    weight, pace_weight = (jnp.full(STEPS * each, span / each) for each in (SAMPLES, PACES))
+    forces = sampled_slacks(table, seen, duration, steps, samples // count, linear_slacks).reshape(samples, -1)
+    span = stop_gradient(when[-1] - when[0]) / intervals
+    weight, pace_weight = (jnp.full(each, span / each) for each in (samples, PACES))
     forces = jnp.where(span > 0, forces, 0.0)
     return after, _Samples(forces, weight, _paces(steps) / (table.length / intervals), pace_weight)
 
@@ -151,27 +164,38 @@ def _one_part(table: Table, how: Integration, intervals: int, at: _Way, q: Float
 def _arcs(table: Table, seen: Window, duration, when, place, piece) -> Arcs:
     """A part's steps."""
     share, s, w = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (when, place[:, 0], place[:, 1]))
-    pieces, row = jnp.broadcast_to(piece, STEPS), jnp.zeros(STEPS, int)
+    count = share.shape[0]
+    pieces, row = jnp.broadcast_to(piece, count), jnp.zeros(count, int)
     live = share[:, 1] > share[:, 0]
     quintic = jax.vmap(arc, (None, None, None, 0, 0, 0, 0, 0, 0))(table, seen, duration, share, s, w, pieces, row, live)
-    return Arcs(share, quintic, pieces, row, jnp.zeros(STEPS, bool), live)
+    return Arcs(share, quintic, pieces, row, jnp.zeros(count, bool), live)
 
 
 def _paces(steps: Arcs) -> Float[Array, "paces"]:
-    """What bounds the speed within each step from below: while all are positive, it is nowhere less than the least.
+    """What bounds the speed in each half from below: while all are positive, it is nowhere less than the least.
 
-    They are the coefficients, but the last, of `ds/dxi` by Bernstein's polynomials: the first is the speed at the
-    step's start, the last that at the next one's. Speeds at some places alone would let it fall below zero between
+    They are the coefficients, but the last, of `ds/dxi` by Bernstein's polynomials: the first is the speed where the
+    half begins, the last that where the next one does. Speeds at some places alone would let it fall below zero between
     them, where an honest simulation stops.
     """
     width = steps.share[:, 1] - steps.share[:, 0]
-    basis = np.array([[math.comb(i, j) / math.comb(4, j) for j in range(5)] for i in range(PACES)])
-    slopes = jax.vmap(derivative)(steps.quintic) @ basis.T
+    slopes = jax.vmap(derivative)(steps.quintic) @ _bernstein(PACES // HALF // width.size).T
     return jnp.where(steps.live[:, None], slopes / jnp.where(steps.live, width, 1.0)[:, None], 1.0).ravel()
 
 
-def _to_break(table, seen, duration, how, at: _Way):
-    """Steps from where an interval has come to its end or the end of the piece, whichever is first.
+@functools.cache
+def _bernstein(parts: int) -> Float[np.ndarray, "coefficients 5"]:
+    """From the coefficients of a quartic on [0, 1] to the first `HALF` by Bernstein in each of so many equal parts."""
+    basis = np.array([[math.comb(i, j) / math.comb(4, j) for j in range(5)] for i in range(HALF)])
+    shift = [
+        [[math.comb(j, i) * (k / parts) ** (j - i) / parts**i if i <= j else 0.0 for j in range(5)] for i in range(5)]
+        for k in range(parts)
+    ]
+    return np.concatenate([basis @ np.array(one) for one in shift])
+
+
+def _to_break(table, seen, duration, how, at: _Way, count: int):
+    """`count` steps from where an interval has come to its end or the end of the piece, whichever is first.
 
     Returns the shares and states of the steps' ends, and whether the piece ended.
     """
@@ -184,11 +208,11 @@ def _to_break(table, seen, duration, how, at: _Way):
 
         def once(state, _):
             share, y = state
-            y = single_step(table, seen, duration, how, at.piece, row, share, y, length / STEPS)
-            share = share + length / STEPS
+            y = single_step(table, seen, duration, how, at.piece, row, share, y, length / count)
+            share = share + length / count
             return (share, y), (share, y)
 
-        _, (when, place) = jax.lax.scan(once, (share, y), None, length=STEPS)
+        _, (when, place) = jax.lax.scan(once, (share, y), None, length=count)
         return jnp.concatenate([share[None], when]), jnp.concatenate([y[None], place])
 
     model = (table, seen, duration)
@@ -218,6 +242,6 @@ def _to_break(table, seen, duration, how, at: _Way):
     # The cut lies where the end is exactly the goal: a shift of rounding size that carries the cut's derivatives.
     pace = jnp.where(onward, stop_gradient(place[-1, 1]), 1.0)
     late = jnp.where(onward, (jnp.where(onward, goal, 0.0) - place[-1, 0]) / pace, 0.0)
-    shift = late * jnp.linspace(0.0, 1.0, STEPS + 1)
+    shift = late * jnp.linspace(0.0, 1.0, count + 1)
     place = place + stop_gradient(jax.vmap(rate)(when, place)) * shift[:, None]
     return when + shift, jnp.where(settled, place, jnp.nan), onward
