@@ -251,7 +251,7 @@ def _on(mesh: Mesh, program: Program, told: tuple, *each):
     return program(told, *each) if mesh.size == 1 else _apart(mesh, program, told, *each)
 
 
-@eqx.filter_jit
+@Program
 def _apart(mesh: Mesh, program: Program, told: tuple, *each):
     arrays, static = eqx.partition(told, eqx.is_array)
 
