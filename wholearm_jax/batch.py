@@ -233,17 +233,20 @@ def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Leve
     """Check `BLOCK` scenes a device."""
     side_by_side = source.same_wires or mesh.devices.flat[0].platform != "cpu"
     told = source, schedule, arrival, level, side_by_side
-    compiled = beside(_on, mesh, _checks_of, told, numbers, _blank_tables(source, level, mesh))
+    compiled = beside(_check_blank, mesh, told, numbers)
     tables = _on(mesh, _tables_of, (source, level, side_by_side), numbers)
     compiled.wait()
     return _on(mesh, _checks_of, told, numbers, tables)
 
 
-def _blank_tables(source: Source, level: Level, mesh: Mesh) -> Table:
-    """Tables without wires for a block of scenes, where those that have them will be."""
-    shape = BLOCK * mesh.size, len(source.nominal.phases)
+def _check_blank(mesh: Mesh, told: tuple, numbers) -> None:
+    """Check scenes on tables without wires: that compiles the program for those that have some."""
+    source, _, _, level, _ = told
+    shape = len(numbers), len(source.nominal.phases)
     tables = jax.tree.map(lambda a: np.broadcast_to(a, (*shape, *a.shape)), blank(level.resolution))
-    return tables if mesh.size == 1 else jax.device_put(tables, NamedSharding(mesh, PartitionSpec("scenes")))
+    if mesh.size > 1:  # where those that are traced will be
+        tables = jax.device_put(tables, NamedSharding(mesh, PartitionSpec("scenes")))
+    _on(mesh, _checks_of, told, numbers, tables)
 
 
 def _on(mesh: Mesh, program: Program, told: tuple, *each):

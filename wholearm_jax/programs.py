@@ -126,13 +126,13 @@ class Program:
 class Beside:
     """A call that is made in a thread of its own, for the programs that it compiles: what it returns is dropped."""
 
-    def __init__(self, function: Callable, args) -> None:
-        self._function, self._args, self._done = function, args, Future()
+    def __init__(self) -> None:
+        self._done: Future[None] = Future()
 
-    def make(self) -> None:
+    def make(self, function: Callable, args) -> None:
         """Make it here and now."""
         try:
-            self._function(*self._args)
+            function(*args)
             self._done.set_result(None)
         except BaseException as raised:  # told to who waits for it
             self._done.set_exception(raised)
@@ -150,8 +150,8 @@ def beside(function: Callable, *args) -> Beside:
     kind = [(leaf.shape, leaf.dtype) if isinstance(leaf, ARRAYS) else (type(leaf), leaf) for leaf in leaves]
     key = function, tree, tuple(kind)
     if key not in _calls_beside:
-        _calls_beside[key] = Beside(function, args)
-        _waiting.append(_calls_beside[key])
+        _calls_beside[key] = Beside()
+        _waiting.append((_calls_beside[key].make, function, args))
     return _calls_beside[key]
 
 
@@ -159,11 +159,11 @@ def _start() -> None:
     """Begin with what waits to be made."""
     with _starting:
         while _waiting:
-            _thread().submit(_waiting.pop(0).make)
+            _thread().submit(*_waiting.pop(0))
 
 
 _calls_beside: dict[Any, Beside] = {}
-_waiting: list[Beside] = []
+_waiting: list[tuple] = []
 _starting = threading.Lock()
 
 
