@@ -27,7 +27,7 @@ from wholearm_jax.reduction import on_panel, powers
 from wholearm_jax.sampling import SAMPLED, sample
 from wholearm_jax.scene import body
 from wholearm_jax.schedule import interval, torque_in
-from wholearm_jax.stepping import found
+from wholearm_jax.stepping import Stop, found
 from wholearm_jax.wire import Resolution
 
 COARSE = Resolution(6, 16, 8)
@@ -96,7 +96,8 @@ def stepped(table, seen, duration):
         return jnp.stack([y[1], acceleration(table, seen, duration, 0, row, u, y[0], y[1])])
 
     y, final = jnp.stack([table.breaks[0], jnp.zeros(())]), jnp.ones(())
-    return found(field, seen, wa.Integration(), 0 * final, final, y, lambda y: y[0] > table.breaks[1], final).y
+    stop = Stop(lambda y: y[0] > table.breaks[1], lambda *_: jnp.asarray(False))  # as much is watched there
+    return found(field, seen, wa.Integration(), 0 * final, final, y, stop, final).y
 
 
 def rows(problem, repeats: int) -> list[dict]:

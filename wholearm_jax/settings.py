@@ -16,7 +16,7 @@ def configure(*, compiled: Literal["quickly", "well"] = "quickly") -> None:
     Every loop becomes one function: by default XLA runs a loop of such small steps as a sequence of kernels, each of
     which costs more to start than it computes. A margin takes 0.75 of the time then, its gradient 0.2 to 0.3. Compiled
     `"quickly"`, as suits single scenes, kernels come from XLA's older emitters and are optimised little: half of the
-    compile time. Compiled `"well"`, as suits `check`, very many scenes run faster by a ninth. What `XLA_FLAGS` in the
+    compile time. Compiled `"well"`, as suits `check`, very many scenes run faster by an eighth. What `XLA_FLAGS` in the
     environment says already stays as it is.
 
     >>> wa.configure()

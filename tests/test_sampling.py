@@ -1,0 +1,62 @@
+"""Trajectories: what is sampled is the motion, also where a phase ends before its time."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.sampling import Trajectory
+from wholearm_jax.scene import replace_duration
+
+SAMPLES = 401
+
+
+def assert_moves_as_it_says(course):
+    """Differences of `z` are `z_dot`, but for what they miss where an acceleration jumps."""
+    step = np.diff(course.time)[0]
+    off = np.abs((course.z[2:] - course.z[:-2]) / (2 * step) - course.z_dot[1:-1])
+    largest = np.abs(course.z_dot).max(0)
+    np.testing.assert_array_less(off.max(0), 2e-2 * largest + 1e-9)
+    np.testing.assert_array_less(np.median(off, axis=0), 1e-4 * largest + 1e-9)
+
+
+@pytest.fixture(scope="module")
+def early():
+    """A phase that is pushed to its wire's end in half of its time, and caught there."""
+    found = wa.search(wa.load("hexagon"))
+    phase = found.scene.phases[0]
+    taken = float(phase.duration)
+    scene = eqx.tree_at(lambda s: s.phases, found.scene, (replace_duration(phase, 2 * taken),))
+    torque = wa.torque([0.0, 2 * taken], [found.torque.values[0]] * 2)
+    result = wa.simulate(scene, torque)
+    assert result.status is wa.Status.OK, result.message
+    return result, taken
+
+
+def test_who_is_caught_early_rests_where_the_wire_ends(early):
+    result, taken = early
+    (course,) = wa.trajectory(result, SAMPLES)
+    moves, rests = course.time < taken - 1e-6, course.time > taken + 1e-6
+    assert moves.sum() >= SAMPLES // 2
+    assert rests.sum() >= SAMPLES // 2
+    assert np.all(course.z_dot[rests] == 0)
+    assert np.all(np.isnan(course.cn[rests]))
+    assert np.all(np.abs(course.z_dot[moves][1:]).max(1) > 0)
+    assert np.all(np.isfinite(course.cn[moves]))
+    np.testing.assert_allclose(course.z[rests] - course.z[-1], 0.0, atol=1e-12)
+    assert_moves_as_it_says(Trajectory(*(column[moves] for column in course)))
+
+
+def test_phases_that_pass_on_at_speed_are_sampled_until_they_do():
+    result = wa.optimise(wa.load("flight")).result
+    assert result.status is wa.Status.OK, result.message
+    courses = wa.trajectory(result, SAMPLES)
+    for phase, course in zip(result.phases, courses, strict=True):
+        assert_moves_as_it_says(course)
+        end = phase.time if phase.arrive == "moving" else phase.start + phase.duration
+        assert course.time[-1] == pytest.approx(end)
+    for before, after, phase in zip(courses, courses[1:], result.phases, strict=False):
+        assert phase.arrive == "moving"
+        assert after.time[0] == pytest.approx(before.time[-1])
+        np.testing.assert_allclose(after.z[0], before.z[-1], atol=1e-8)
+        np.testing.assert_allclose(phase.outcome.leaving, before.z_dot[-1], rtol=1e-8, atol=1e-10)
