@@ -6,10 +6,11 @@ each step is
     z <- z - K C(z) - x f / f',      f' = df/ds along x and x' = d2z/ds2
 
 so that nothing is differentiated but `f`, once, along the wire. How `f` changes beside the wire is left out; as each
-step ends on it but for the square of its length, the digits double with every second step. The iterations run on
-constants; one further step, with the last iteration's `K`, `x'` and `f'`, carries the derivatives, by the implicit
-function theorem: `z - K C(z)` lies on the wire however the scene moves, and there `f` counts. Second derivatives of the
-root are not carried.
+step ends on it but for the square of its length, the digits double with every second step. The first step leaves `f`
+itself out: beside the wire its value says little, and of two places close together it would choose any. The iterations
+run on constants; one further step, with the last iteration's `K`, `x'` and `f'`, carries the derivatives, by the
+implicit function theorem: `z - K C(z)` lies on the wire however the scene moves, and there `f` counts. Second
+derivatives of the root are not carried.
 """
 
 from collections.abc import Callable
@@ -72,7 +73,7 @@ def newton(
         at = along_wire(fixed, z, u)
         value, rate = jax.jvp(lambda z, x: function(fixed, z, x, *settings), (z, at.x), (at.x, at.bend))
         left = constraints(fixed.contacts, z)
-        move = -times(at.back, left) - at.x * (value / rate)
+        move = -times(at.back, left) - at.x * jnp.where(count > 0, value / rate, 0.0)
         move = jnp.where(jnp.isfinite(move), move, 0.0)
         size = jnp.abs(move).max()
         move = move * jnp.minimum(1.0, longest / jnp.maximum(size, longest * jnp.finfo(z.dtype).eps))
@@ -81,7 +82,7 @@ def newton(
     def going(state):
         *_, residual, count, size = state
         # What is left is of the square of the step.
-        return (count < steps) & (size > digits(z, 9 / 16)) & (residual > 0)
+        return (count < steps) & ((count < 2) | (size > digits(z, 9 / 16))) & (residual > 0)
 
     far, none = jnp.asarray(jnp.inf, z.dtype), jnp.zeros(5, z.dtype)
     nowhere = Along(jnp.zeros((5, 4), z.dtype), none, none, jnp.zeros((), z.dtype))

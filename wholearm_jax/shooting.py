@@ -35,7 +35,7 @@ from wholearm_jax.reduction import Table, derivative
 from wholearm_jax.schedule import Window
 from wholearm_jax.stepping import Integration
 
-FINE = 50  # intervals of a phase from which one solver step in each serves; fewer take two
+ONE_STEP = 50  # intervals of a phase from which one solver step in each serves; fewer take two
 ROWS = 4 + MOST_ROLLING  # slacks a sample
 SPACES = 8  # between the places of an interval at which forces are sampled
 PARTS = 3  # pieces of the wire that one interval may touch
@@ -57,7 +57,7 @@ class Variables(eqx.Module):
 
 def steps_of(intervals: int) -> int:
     """Solver steps in each interval of a phase, and in each part of one that is cut."""
-    return 1 if intervals >= FINE else 2
+    return 1 if intervals >= ONE_STEP else 2
 
 
 def samples_of(intervals: int) -> int:
