@@ -67,10 +67,10 @@ def test_the_digits_double_with_every_second_step(flip):
     mechanics, near, u, contact = flip
     far = near + 0.02 * jnp.asarray([1.0, -1.0, 1.0, 1.0, -1.0])
     exact = newton(turns, mechanics, near, u, contact).z
-    errors = [float(jnp.abs(newton(turns, mechanics, far, u, contact, steps=k).z - exact).max()) for k in range(2, 7)]
+    errors = [float(jnp.abs(newton(turns, mechanics, far, u, contact, steps=k).z - exact).max()) for k in range(1, 6)]
     for before, after in zip(errors, errors[2:], strict=False):
         assert after < before**2 + 1e-14
-    assert errors[0] > 1e-5
+    assert errors[0] > 1e-4
     assert errors[-1] < 1e-14
 
 

@@ -94,22 +94,23 @@ def test_derivatives_of_an_interval_that_is_cut(flip):
         np.testing.assert_allclose(exact[:, k], richardson, rtol=1e-5, atol=1e-6 * (jnp.abs(exact[:, k]).max() + 1e-3))
 
 
-@pytest.mark.parametrize("knots", [31, 51])  # with two solver steps an interval, and with one
-def test_joined_intervals_are_the_phase(knots):
+@pytest.mark.parametrize(("knots", "late", "near"), [(31, 1e-9, 1e-8), (51, 1e-4, 1e-6)])
+def test_joined_intervals_are_the_phase(knots, late, near):
+    """With two solver steps an interval, and with one: when that comes to rest is known to the square root of where."""
     scene = wa.load("hexagon")
     scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
     found = wa.optimise(scene, knots=knots)
     table, motion = found.result.phases[0].traced.table, found.result.phases[0].outcome.motion
     shares = np.asarray(motion.share)
     at = [int(np.argmin(np.abs(shares - k / (knots - 1)))) for k in range(knots)]
-    late = np.abs(shares[at] - np.arange(knots) / (knots - 1))
-    assert late[:-1].max() < 1e-9, "steps end on the knots"
-    assert late[-1] < 1e-4, "when it comes to rest is known to the square root of where"
+    off = np.abs(shares[at] - np.arange(knots) / (knots - 1))
+    assert off[:-1].max() < 1e-9, "steps end on the knots"
+    assert off[-1] < late
     state = np.stack([(motion.s[np.array(at)] - table.breaks[0]), motion.w[np.array(at)]], axis=1) / float(table.length)
     p = Variables((found.torque.values / table.torque_limit)[None], jnp.asarray(state)[None], jnp.zeros(1))
     ends = shoot(table, HOW, knots - 1, local(p)[0]).end
     np.testing.assert_allclose(ends[:-1], state[1:-1], atol=1e-8)
-    np.testing.assert_allclose(ends[-1], state[-1], atol=1e-6)  # the simulation lands on the wire's end or on rest
+    np.testing.assert_allclose(ends[-1], state[-1], atol=near)  # the simulation lands on the wire's end or on rest
 
 
 def test_a_curved_step_starts_along_its_direction_and_keeps_pinned_torques(flip):
