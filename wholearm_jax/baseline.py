@@ -19,7 +19,7 @@ import numpy as np
 
 from wholearm_jax.phase import Traced, run, run_blank
 from wholearm_jax.plan import require_motion, simulate, trace
-from wholearm_jax.programs import Beside, beside
+from wholearm_jax.programs import Beside, beside, wait
 from wholearm_jax.requirements import require_x64
 from wholearm_jax.result import Result
 from wholearm_jax.scene import Phase, Scene, replace_duration
@@ -62,7 +62,7 @@ def search(scene: Scene, *, longest: float = 10.0, traced: tuple[Traced, ...] = 
     if not traced:
         compiled = search_beside()
         traced = trace(scene)
-        compiled.wait()
+        wait(compiled)
     phases, times, rows, start, count = [], [], [], 0.0, 0
     for phase, at in zip(scene.phases, traced, strict=True):
         torque, duration, tried = _search_phase(at, longest)

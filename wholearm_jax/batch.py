@@ -33,7 +33,7 @@ from wholearm_jax.plan import (
     steps_within,
     traced_together,
 )
-from wholearm_jax.programs import Program, beside
+from wholearm_jax.programs import Program, beside, wait
 from wholearm_jax.reduction import Table, blank
 from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result
@@ -235,7 +235,7 @@ def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Leve
     told = source, schedule, arrival, level, side_by_side
     compiled = beside(_check_blank, mesh, told, numbers)
     tables = _on(mesh, _tables_of, (source, level, side_by_side), numbers)
-    compiled.wait()
+    wait(compiled)
     return _on(mesh, _checks_of, told, numbers, tables)
 
 

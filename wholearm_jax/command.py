@@ -125,11 +125,11 @@ def optimise(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from wholearm_jax.optimiser import PASSING, compile_ahead
+    from wholearm_jax.optimiser import PASSING, optimise_beside
     from wholearm_jax.optimiser import optimise as find
 
     begun = time.perf_counter()
-    compile_ahead(loaded, knots=knots)
+    optimise_beside(loaded, knots=knots)
     traced = traced_or_refused(scene, loaded)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
@@ -172,13 +172,14 @@ def simulate(
     loaded = scene_of(scene, set_)
     from wholearm_jax.optimiser import bounds
     from wholearm_jax.plan import simulate_beside
+    from wholearm_jax.programs import wait
     from wholearm_jax.result_file import read_torque
 
     schedule = read_torque(torque)
     folder = made_folder(out)
     compiled = simulate_beside(loaded, schedule, tolerance)
     traced = traced_or_refused(scene, loaded)
-    compiled.wait()
+    wait(compiled)
     result = predicted(loaded, schedule, torque, tolerance, traced)
     _tell(result)
     if check_gradient:
@@ -271,11 +272,12 @@ def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
     folder = made_folder(out)
     from wholearm_jax.baseline import search as look
     from wholearm_jax.baseline import search_beside
+    from wholearm_jax.programs import wait
     from wholearm_jax.optimiser import bounds
 
     compiled = search_beside()
     traced = traced_or_refused(scene, loaded)
-    compiled.wait()
+    wait(compiled)
     try:
         found = look(loaded, traced=traced)
     except ValueError as error:

@@ -24,7 +24,6 @@ from wholearm_jax.pacing import Problem, Step, descend
 from wholearm_jax.phase import Traced, run
 from wholearm_jax.plan import stacked
 from wholearm_jax.precision import array
-from wholearm_jax.programs import Beside
 from wholearm_jax.result import stays
 from wholearm_jax.scene import Phase, Scene
 from wholearm_jax.schedule import Torque, evenly, in_turn, padded
@@ -40,8 +39,7 @@ GOOD = 0.99  # share of the bound with which no further start is tried
 
 @dataclass(frozen=True)
 class Wanted:
-    """What `optimise` was asked for; `rows` is the size of the whole plan's schedule: those of one share programs, and
-    `compiled` is what to wait for before these are called."""
+    """What `optimise` was asked for; `rows` is the size of the whole plan's schedule: those of one share programs."""
 
     knots: int
     rows: int
@@ -52,7 +50,6 @@ class Wanted:
     optimiser: optax.GradientTransformation | None
     tolerance: float
     callback: Callable[[Step], None] | None
-    compiled: list[Beside]
 
 
 @dataclass(frozen=True)
@@ -116,9 +113,7 @@ def optimise_group(scene: Scene, group: Group) -> tuple[list[Torque], str, list[
         if int(at.table.status) != Status.OK:
             why = f"the wire cannot be followed: {Status(int(at.table.status)).label}"
             return [evenly(t, np.zeros((wanted.knots, 2))) for t in group.durations], why, []
-    begins = guesses(group.traced, group.durations, wanted.knots, TORQUE_SHARE)
-    for one in wanted.compiled:
-        one.wait()
+    begins = guesses([at.table for at in group.traced], group.durations, wanted.knots, TORQUE_SHARE)
     weakest = int(np.argmin(group.bounds))
     if group.bounds[weakest] <= 0:
         where = 100 * float(group.tops[weakest].share)

@@ -10,9 +10,9 @@ import jax
 import numpy as np
 
 from wholearm_jax.linearisation import passed_on
-from wholearm_jax.phase import Traced
 from wholearm_jax.precision import array
 from wholearm_jax.programs import Program
+from wholearm_jax.reduction import Table
 from wholearm_jax.shooting import Variables
 from wholearm_jax.squeeze import holds
 
@@ -23,19 +23,18 @@ SPEEDS = (1.0, 0.4, 2.0)  # speeds at changes of formation to start from [wire l
 OTHERS = ((16.0, 1.0), (1.0, 1.0), (1.0, 16.0))  # further starts: a long dwell first, none, a long dwell last
 
 
-def guesses(traced: list[Traced], durations, knots: int, share: float) -> list[Variables]:
+def guesses(tables: list[Table], durations, knots: int, share: float) -> list[Variables]:
     """Motions with the torques that give them, within a `share` of the limits, by the best squeeze.
 
     One phase goes from rest to rest: first that of `PROFILES` with the largest margin (the even one unless another
     gains more than 2 %), then `OTHERS`. Several go through their changes of formation at each of `SPEEDS`.
     """
-    if len(traced) == 1:
+    if len(tables) == 1:
         motions = [_profile(knots, *powers) for powers in PROFILES]
-        torque, margins = _squeezed(traced[0].table, durations[0], motions, share)
+        torque, margins = _squeezed(tables[0], durations[0], motions, share)
         best = 0 if margins[0] >= margins.max() - 0.02 * abs(margins.max()) else int(np.argmax(margins))
         order = [best, *(PROFILES.index(other) for other in OTHERS if PROFILES[best] != other)]
         return [_variables([torque[k]], [motions[k]], durations) for k in order]
-    tables = [at.table for at in traced]
     ratios = [float(_passed_on(*pair)) for pair in itertools.pairwise(tables)]
     found = []
     for speed in SPEEDS:

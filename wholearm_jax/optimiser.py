@@ -16,7 +16,7 @@ import numpy as np
 import optax
 
 from wholearm_jax.descent import advance, begin
-from wholearm_jax.group import Group, Wanted, descent_method, optimise_group, stacked_tables
+from wholearm_jax.group import TORQUE_SHARE, Group, Wanted, descent_method, optimise_group, stacked_tables
 from wholearm_jax.guesses import guesses
 from wholearm_jax.handover import Handover, handovers, steady
 from wholearm_jax.linearisation import Limits
@@ -24,7 +24,7 @@ from wholearm_jax.pacing import HOW, Step
 from wholearm_jax.phase import Traced, balance_at_start, run_blank
 from wholearm_jax.plan import outcomes, trace
 from wholearm_jax.precision import array
-from wholearm_jax.programs import Beside, Program, beside
+from wholearm_jax.programs import Beside, Program, beside, wait
 from wholearm_jax.reduction import blank
 from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result, describe
@@ -79,7 +79,7 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
     def torques(at, phase):
         if phase.arrive == "hold":
             return steady(scene, phase, at, knots)
-        start = guesses([at], [float(phase.duration)], knots, 1.0)[0]
+        start = guesses([at.table], [float(phase.duration)], knots, 1.0)[0]
         return evenly(float(phase.duration), at.table.torque_limit * start.torque[0])
 
     return in_turn([torques(*pair) for pair in zip(traced, scene.phases, strict=True)])
@@ -152,11 +152,13 @@ def optimise(
         raise ValueError("durations are (shortest, longest), positive and in this order")
     if durations is not None and durations[0] == durations[1]:
         scene, durations = _lasting(scene, durations[0]), None
-    compiled = compile_ahead(scene, knots=knots, optimiser=optimiser)
+    compiled = optimise_beside(scene, knots=knots, optimiser=optimiser)
     traced = traced or trace(scene)
+    if any(int(at.table.status) == Status.OK for at in traced):
+        wait(*compiled)
     tops = bounds(scene, traced=traced)
     rows = _rows(scene, knots)
-    wanted = Wanted(knots, rows, steps, rate_limit, durations, passing, optimiser, tolerance, callback, compiled)
+    wanted = Wanted(knots, rows, steps, rate_limit, durations, passing, optimiser, tolerance, callback)
     found = []
     for lead in LEADS if rate_limit is not None else LEADS[:1]:
         found.append(_attempt(scene, traced, tops, wanted, lead))
@@ -202,13 +204,14 @@ def _lasting(scene: Scene, duration: float) -> Scene:
     return eqx.tree_at(lambda s: s.phases, scene, tuple(phases))
 
 
-def compile_ahead(
+def optimise_beside(
     scene: Scene, *, knots: int = 51, optimiser: optax.GradientTransformation | None = None
-) -> list[Beside]:
-    """Begin to compile the programs of `optimise` in a thread of its own, as can be done while wires are traced."""
-    rows = _rows(scene, knots)
-    sizes = {len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"}
-    return [beside(_compile, n, knots, rows, descent_method(optimiser, n)) for n in sorted(sizes)]
+) -> tuple[Beside, ...]:
+    """Compile what `optimise` runs in a thread of its own, while wires are traced; it is to be waited for."""
+    sizes = sorted({len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"})
+    squeezes = beside(_squeeze_blank, tuple(sizes), knots, at_once=True)
+    descents = [beside(_advance_blank, n, knots, descent_method(optimiser, n)) for n in sizes]
+    return squeezes, *descents, beside(run_blank, _rows(scene, knots), with_room(Integration(), knots))
 
 
 def _rows(scene: Scene, knots: int) -> int:
@@ -225,17 +228,23 @@ def _groups(scene: Scene) -> list[list[int]]:
     return groups
 
 
-def _compile(phases: int, knots: int, rows: int, method) -> None:
-    """Run the descent's programs once, on blank tables."""
-    table = blank(Resolution())
-    tables = stacked_tables([table] * phases)
+def _squeeze_blank(sizes: tuple[int, ...], knots: int) -> None:
+    """Make the bounds and starts of groups of such sizes on tables that have no wire."""
+    table, one = blank(Resolution()), array(1.0)
+    _bound(table, one, array(True), array(True))
+    for phases in sizes:
+        guesses([table] * phases, np.ones(phases), knots, TORQUE_SHARE)
+
+
+def _advance_blank(phases: int, knots: int, method) -> None:
+    """Take one step of a descent on tables that have no wire."""
+    tables = stacked_tables([blank(Resolution())] * phases)
     each = np.ones(phases)
     plain = (np.full(2, np.inf), each, each, np.zeros(()), np.zeros((phases, knots), bool), each)
     limits = Limits(*(array(a) for a in plain))
     empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
     p = Variables(*(array(a) for a in empty))
     advance(begin(p, method), tables, limits, HOW, method)
-    run_blank(rows, with_room(Integration(), knots))
 
 
 _bound = Program(bound)

@@ -26,7 +26,7 @@ from wholearm_jax.phase import (
     start_configuration,
 )
 from wholearm_jax.precision import array, digits
-from wholearm_jax.programs import Beside, beside, transformed
+from wholearm_jax.programs import Beside, beside, transformed, wait
 from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result, describe
 from wholearm_jax.scene import Body, Phase, Scene, body
@@ -273,7 +273,7 @@ def simulate(
     if not traced:
         compiled = simulate_beside(scene, torque, tolerance, max_steps)
         traced = trace(scene)
-        compiled.wait()
+        wait(compiled)
     while True:
         found = outcomes(scene, torque, traced, _integration(scene, torque, tolerance, max_steps), arrival)
         short = any(int(o.verdict.status) == Status.MAX_STEPS for o in found)

@@ -126,44 +126,58 @@ class Program:
 class Beside:
     """A call that is made in a thread of its own, for the programs that it compiles: what it returns is dropped."""
 
-    def __init__(self) -> None:
-        self._done: Future[None] = Future()
+    def __init__(self, function: Callable, args: tuple) -> None:
+        self._calls, self._done = [(function, args)], Future()
 
-    def make(self, function: Callable, args) -> None:
-        """Make it here and now."""
+    def make(self) -> None:
+        """Make it here and now, unless it has begun elsewhere."""
+        try:
+            function, args = self._calls.pop()  # by one thread alone
+        except IndexError:
+            return
         try:
             function(*args)
             self._done.set_result(None)
         except BaseException as raised:  # told to who waits for it
             self._done.set_exception(raised)
 
-    def wait(self) -> None:
-        """Wait until it is made; raises what it raised."""
-        _start()
+    def result(self) -> None:
+        """Nothing, once it is made; raises what it raised."""
         self._done.result()
 
 
-def beside(function: Callable, *args) -> Beside:
+def beside(function: Callable, *args, at_once: bool = False) -> Beside:
     """Call a function in a thread of its own, once for every kind of arguments: after what was put beside before, and
-    as soon as the next program has been traced, or one waits for it."""
+    as soon as the next program has been traced, or one waits for it; or `at_once`."""
     leaves, tree = jax.tree.flatten(args)
     kind = [(leaf.shape, leaf.dtype) if isinstance(leaf, ARRAYS) else (type(leaf), leaf) for leaf in leaves]
     key = function, tree, tuple(kind)
     if key not in _calls_beside:
-        _calls_beside[key] = Beside()
-        _waiting.append((_calls_beside[key].make, function, args))
+        _calls_beside[key] = Beside(function, args)
+        _waiting.append(_calls_beside[key])
+        if at_once:
+            _start()
     return _calls_beside[key]
+
+
+def wait(*several: Beside) -> None:
+    """Wait for what was put beside; what has not begun by then is made here, the last first."""
+    _start()
+    for one in reversed(several):
+        one.make()
+    for one in several:
+        one.result()
 
 
 def _start() -> None:
     """Begin with what waits to be made."""
     with _starting:
         while _waiting:
-            _thread().submit(*_waiting.pop(0))
+            _thread().submit(_waiting.pop(0).make)
 
 
 _calls_beside: dict[Any, Beside] = {}
-_waiting: list[tuple] = []
+_waiting: list[Beside] = []
 _starting = threading.Lock()
 
 
