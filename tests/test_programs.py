@@ -121,29 +121,61 @@ def test_what_cannot_be_named_is_not_kept(folder):
     assert not list(folder.iterdir())
 
 
-def test_what_is_put_beside_is_called_once_for_each_kind_after_the_next_program_is_traced(monkeypatch):
+@pytest.fixture
+def no_calls_beside(monkeypatch):
     monkeypatch.setattr(programs, "_calls_beside", {})
-    called = []
+
+
+@pytest.mark.usefixtures("no_calls_beside")
+def test_what_is_put_beside_is_called_once_for_each_kind_after_the_next_program_is_traced():
+    called, all_made = [], threading.Event()
 
     def note(number, array):
         called.append((number, array.shape, threading.current_thread()))
+        if len(called) == 3:
+            all_made.set()
 
     calls = [programs.beside(note, number, jnp.zeros(size)) for number, size in ((1, 2), (2, 2), (1, 2), (1, 3))]
     assert calls[0] is calls[2]
     assert not called
     TRACED.clear()
     call(power=7)
-    for one in calls:
-        one.wait()
+    assert all_made.wait(60)
+    programs.wait(*calls)
     assert [(number, shape) for number, shape, _ in called] == [(1, (2,)), (2, (2,)), (1, (3,))]
     assert all(thread is not threading.current_thread() for *_, thread in called)
 
 
-def test_who_waits_for_what_is_beside_is_told_what_it_raised(monkeypatch):
-    monkeypatch.setattr(programs, "_calls_beside", {})
+@pytest.mark.usefixtures("no_calls_beside")
+def test_what_need_not_wait_for_the_next_program_is_called_at_once():
+    made = threading.Event()
+    programs.beside(made.set, at_once=True)
+    assert made.wait(60)
 
+
+@pytest.mark.usefixtures("no_calls_beside")
+def test_who_waits_makes_what_has_not_begun():
+    first_began, last_made, threads = threading.Event(), threading.Event(), []
+
+    def first():
+        first_began.set()
+        assert last_made.wait(60)
+
+    def last():
+        threads.append(threading.current_thread())
+        last_made.set()
+
+    calls = programs.beside(first, at_once=True), programs.beside(last)
+    assert first_began.wait(60)
+    assert not last_made.is_set()
+    programs.wait(*calls)
+    assert threads == [threading.current_thread()]
+
+
+@pytest.mark.usefixtures("no_calls_beside")
+def test_who_waits_for_what_is_beside_is_told_what_it_raised():
     def fail():
         raise ValueError("it cannot be compiled")
 
     with pytest.raises(ValueError, match="cannot be compiled"):
-        programs.beside(fail).wait()
+        programs.wait(programs.beside(fail))

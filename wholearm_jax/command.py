@@ -272,8 +272,8 @@ def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
     folder = made_folder(out)
     from wholearm_jax.baseline import search as look
     from wholearm_jax.baseline import search_beside
-    from wholearm_jax.programs import wait
     from wholearm_jax.optimiser import bounds
+    from wholearm_jax.programs import wait
 
     compiled = search_beside()
     traced = traced_or_refused(scene, loaded)

@@ -107,20 +107,19 @@ def shoot(table: Table, how: Integration, intervals: int, q: Float[Array, "cut 7
     An interval that touches more than `PARTS` pieces, or whose cut is not found, ends in NaN.
     """
     cut = q.shape[0]
-    part = partial(_one_part, table, how, intervals)
     begin = jax.vmap(lambda q: _set_out(table, intervals, q))(q)
-    first, samples = jax.vmap(part)(begin, q)
+    first, samples = jax.vmap(partial(_uncut, table, how, intervals))(begin, q)
     all_parts = jax.tree.map(lambda a: jnp.zeros((cut, PARTS, *a.shape[1:]), a.dtype).at[:, 0].set(a), samples)
 
     def waiting(at: _Way):
         return (at.share < 1) & (at.count < PARTS)
 
     def next_part(state):
-        """Most intervals have one part: the others go on one at a time."""
+        """Most intervals have one part: the others go one part at a time."""
         at, all_parts = state
         k = jnp.argmax(waiting(at))
         one = jax.tree.map(lambda a: pick(a, k), at)
-        after, samples = part(one, pick(q, k))
+        after, samples = _one_part(table, how, intervals, one, pick(q, k))
         at = jax.tree.map(lambda a, new: a.at[k].set(new), at, after)
         return at, jax.tree.map(lambda a, new: a.at[k, one.count].set(new), all_parts, samples)
 
@@ -139,13 +138,21 @@ def _set_out(table: Table, intervals: int, q: Float[Array, "7"]) -> _Way:
     return _Way(jnp.zeros(()), y, piece, jnp.zeros((), int))
 
 
+def _uncut(table: Table, how: Integration, intervals: int, at: _Way, q: Float[Array, "7"]) -> tuple[_Way, _Samples]:
+    """To the interval's end, within the piece that it begins in; one that comes past that piece's end does not set
+    out."""
+    seen, duration = _schedule(table, intervals, q)
+    when, place = _steps(table, seen, duration, how, at, 1.0, steps_of(intervals))
+    past = place[-1, 0] > _goal(table, at.piece)
+    ended = _Way(jnp.ones_like(at.share), place[-1], at.piece, at.count + 1)
+    after = jax.tree.map(lambda stay, go: jnp.where(past, stay, go), at, ended)
+    return after, _sampled(table, seen, duration, intervals, when, place, at.piece)
+
+
 def _one_part(table: Table, how: Integration, intervals: int, at: _Way, q: Float[Array, "7"]) -> tuple[_Way, _Samples]:
     """To the interval's end, or the end of the piece."""
-    values, zero = q[2:6].reshape(2, 2) * table.torque_limit, jnp.zeros((), int)
-    seen = Window(jnp.arange(2.0), values, values[1:] - values[:-1], zero, zero)
-    duration = jnp.exp(q[6]) / intervals
-    count, samples = steps_of(intervals), samples_of(intervals)
-    when, place, onward = _to_break(table, seen, duration, how, at, count)
+    seen, duration = _schedule(table, intervals, q)
+    when, place, onward = _to_break(table, seen, duration, how, at, steps_of(intervals))
     factor = table.factor[jnp.minimum(at.piece + 1, table.factor.shape[0] - 1)]
     after = _Way(
         share=jnp.where(onward, when[-1], 1.0),
@@ -153,12 +160,29 @@ def _one_part(table: Table, how: Integration, intervals: int, at: _Way, q: Float
         piece=at.piece + onward,
         count=at.count + 1,
     )
-    steps = _arcs(table, seen, duration, when, place, at.piece)
+    return after, _sampled(table, seen, duration, intervals, when, place, at.piece)
+
+
+def _schedule(table: Table, intervals: int, q: Float[Array, "7"]) -> tuple[Window, Float[Array, ""]]:
+    """An interval's torques, and how long it lasts."""
+    values, zero = q[2:6].reshape(2, 2) * table.torque_limit, jnp.zeros((), int)
+    return Window(jnp.arange(2.0), values, values[1:] - values[:-1], zero, zero), jnp.exp(q[6]) / intervals
+
+
+def _goal(table: Table, piece) -> Float[Array, ""]:
+    """Where a piece ends for intervals: the last one nowhere."""
+    return jnp.where(piece >= table.count - 1, jnp.inf, table.breaks[piece + 1])
+
+
+def _sampled(table: Table, seen: Window, duration, intervals: int, when, place, piece) -> _Samples:
+    """Forces and speeds of a part."""
+    count, samples = steps_of(intervals), samples_of(intervals)
+    steps = _arcs(table, seen, duration, when, place, piece)
     forces = sampled_slacks(table, seen, duration, steps, samples // count, linear_slacks).reshape(samples, -1)
     span = stop_gradient(when[-1] - when[0]) / intervals
     weight, pace_weight = (jnp.full(each, span / each) for each in (samples, PACES))
     forces = jnp.where(span > 0, forces, 0.0)
-    return after, _Samples(forces, weight, _paces(steps) / (table.length / intervals), pace_weight)
+    return _Samples(forces, weight, _paces(steps) / (table.length / intervals), pace_weight)
 
 
 def _arcs(table: Table, seen: Window, duration, when, place, piece) -> Arcs:
@@ -194,49 +218,49 @@ def _bernstein(parts: int) -> Float[np.ndarray, "coefficients 5"]:
     return np.concatenate([basis @ np.array(one) for one in shift])
 
 
+def _steps(table: Table, seen: Window, duration, how: Integration, at: _Way, length, count: int):
+    """Shares and states along `count` steps that together have a length."""
+    row = jnp.zeros((), int)
+
+    def once(state, _):
+        share, y = state
+        y = single_step(table, seen, duration, how, at.piece, row, share, y, length / count)
+        share = share + length / count
+        return (share, y), (share, y)
+
+    _, (when, place) = jax.lax.scan(once, (at.share, at.y), None, length=count)
+    return jnp.concatenate([at.share[None], when]), jnp.concatenate([at.y[None], place])
+
+
 def _to_break(table, seen, duration, how, at: _Way, count: int):
     """`count` steps from where an interval has come to its end or the end of the piece, whichever is first.
 
     Returns the shares and states of the steps' ends, and whether the piece ended.
     """
-    last = at.piece >= table.count - 1
-    goal = jnp.where(last, jnp.inf, table.breaks[at.piece + 1])
-    row = jnp.zeros((), int)
-
-    def advance(share, y, length, model):
-        table, seen, duration = model
-
-        def once(state, _):
-            share, y = state
-            y = single_step(table, seen, duration, how, at.piece, row, share, y, length / count)
-            share = share + length / count
-            return (share, y), (share, y)
-
-        _, (when, place) = jax.lax.scan(once, (share, y), None, length=count)
-        return jnp.concatenate([share[None], when]), jnp.concatenate([y[None], place])
-
-    model = (table, seen, duration)
-    frozen = stop_gradient((at.share, at.y)), stop_gradient(model)
-    whole = 1 - frozen[0][0]
+    goal = _goal(table, at.piece)
+    frozen = stop_gradient((table, seen, duration))
+    still = stop_gradient(at)
+    whole = 1 - still.share
 
     def narrow(bracket):
         """Newton on the part's length, bisecting where it would leave the bracket."""
-        low, high, length, _, count = bracket
-        _, place = advance(*frozen[0], length, frozen[1])
+        low, high, length, _, number = bracket
+        _, place = _steps(*frozen, how, still, length, count)
         miss = place[-1, 0] - goal
         low, high = jnp.where(miss < 0, length, low), jnp.where(miss < 0, high, length)
         guess = length - miss / jnp.where(place[-1, 1] == 0, 1.0, place[-1, 1])
         guess = jnp.where((guess >= low) & (guess <= high), guess, (low + high) / 2)
-        through = (count == 0) & ~(miss > 0)
+        through = (number == 0) & ~(miss > 0)
         near = jnp.abs(guess - length) <= LANDED * whole
-        return low, high, jnp.where(through, whole, guess), through | near, count + 1
+        return low, high, jnp.where(through, whole, guess), through | near, number + 1
 
     start = (0 * whole, whole, whole, ~(whole > 0), 0)
     _, _, length, settled, _ = jax.lax.while_loop(lambda b: ~b[3] & (b[4] < LANDINGS), narrow, start)
     onward = length < whole
-    when, place = advance(at.share, at.y, jnp.where(onward, length, 1 - at.share), model)
+    when, place = _steps(table, seen, duration, how, at, jnp.where(onward, length, 1 - at.share), count)
 
     def rate(share, y):
+        row = jnp.zeros((), int)
         return jnp.stack([y[1], acceleration(table, seen, duration, at.piece, row, share, y[0], y[1])])
 
     # The cut lies where the end is exactly the goal: a shift of rounding size that carries the cut's derivatives.
