@@ -65,6 +65,15 @@ def test_numbers_of_samples_and_steps_are_asked_for(slide):
         optimise_robustly(vary(slide, {"friction": "20%"}, seed=1), steps=0)
 
 
+def test_a_nominal_schedule_keeps_to_the_plan_and_the_limits(slide):
+    varied, limit = vary(slide, {"friction": "20%"}, seed=1), np.asarray(slide.hand.torque_limit)
+    beyond, short = (wa.torque([0.0, end], [[0.0, 0.0], share * limit]) for end, share in ((1.0, 1.1), (0.5, 0.1)))
+    with pytest.raises(ValueError, match=r"finger 1 is .* N m, its limit"):
+        optimise_robustly(varied, nominal=beyond)
+    with pytest.raises(ValueError, match=r"covers 0 to 0\.5 s"):
+        optimise_robustly(varied, nominal=short)
+
+
 def test_every_step_is_told(found, told):
     assert [step for step, _ in told] == list(range(41))
     nominal, robust = found.seen

@@ -29,7 +29,7 @@ from wholearm_jax.precision import array, digits
 from wholearm_jax.programs import Beside, beside, transformed, wait
 from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result, describe
-from wholearm_jax.scene import Body, Phase, Scene, body
+from wholearm_jax.scene import Phase, Scene, body
 from wholearm_jax.schedule import Torque, has_steps, padded, rounded
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration, tolerance_as_data, with_room
@@ -71,27 +71,18 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
 @eqx.filter_jit
 def traced_together(scene: Scene, resolution: Resolution) -> Traced:
     """Every phase of a plan in one program: `Traced` with an axis of phases."""
-    on = partial(trace_next, scene, body(scene.object), resolution)
-    return jax.lax.scan(on, trace_first(scene), stacked([trace_told(p) for p in scene.phases]))[1]
+    solid = body(scene.object)
 
+    def one(at, phase):
+        """Trace a phase from where the one before it ended."""
+        (rough, first), (formation, heading, holds) = at, phase
+        alone = prepare(solid, scene.hand, scene.gravity, formation, rough, heading, resolution)
+        traced = joined(alone, rough, first, holds)
+        ends = jnp.where(holds, start_configuration(traced.table), end_configuration(traced))
+        return (ends, jnp.asarray(False)), traced
 
-def trace_first(scene: Scene):
-    """Where a plan begins, and that it does: what `trace_next` needs of the phases before."""
-    return scene.start, jnp.asarray(True)
-
-
-def trace_told(phase: Phase):
-    """What a plan says of a phase's wire."""
-    return phase.formation, phase.heading, jnp.asarray(phase.arrive == "hold")
-
-
-def trace_next(scene: Scene, solid: Body, resolution: Resolution, at, phase):
-    """Trace the next phase of a plan, from where the one before it ended: one step of a scan."""
-    (rough, first), (formation, heading, holds) = at, phase
-    alone = prepare(solid, scene.hand, scene.gravity, formation, rough, heading, resolution)
-    traced = joined(alone, rough, first, holds)
-    ends = jnp.where(holds, start_configuration(traced.table), end_configuration(traced))
-    return (ends, jnp.asarray(False)), traced
+    told = stacked([(p.formation, p.heading, jnp.asarray(p.arrive == "hold")) for p in scene.phases])
+    return jax.lax.scan(one, (scene.start, jnp.asarray(True)), told)[1]
 
 
 def stacked(several):

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 from wholearm_jax.forces import smooth_margin
 from wholearm_jax.optimiser import optimise
 from wholearm_jax.phase import Traced
-from wholearm_jax.plan import outcomes, require_motion, roomy, steps_within, trace
+from wholearm_jax.plan import outcomes, require_covered, require_motion, roomy, steps_within, trace
 from wholearm_jax.programs import Program
 from wholearm_jax.requirements import require_positive
 from wholearm_jax.schedule import Torque
@@ -75,12 +75,15 @@ def optimise_robustly(
 
     `rate` is the step of Adam as a share of the torque limits. `nominal` starts from another schedule than
     `optimise(ensemble.scene)` finds. `callback` sees each step's number and how its schedule does on the samples.
-    Raises ValueError for a plan that holds its object in a phase, and for numbers that are not positive.
+    Raises ValueError for a plan that holds its object in a phase, for numbers that are not positive, and for a
+    `nominal` schedule that is shorter than the plan or beyond the torque limits.
     """
-    scene = ensemble.scene
+    scene, limit = ensemble.scene, ensemble.scene.hand.torque_limit
     require_positive(samples=samples, knots=knots, steps=steps, arrival=arrival, rate=rate)
     require_motion(scene)
     start = optimise(scene, knots=knots).torque if nominal is None else nominal
+    require_covered(scene, start)
+    _require_within(limit, start)
     seen, unseen = (_traced(ensemble, jnp.arange(samples) + first) for first in (0, samples))
     how = replace(roomy(HOW, scene, start), steps=steps_within(scene, start))
 
@@ -90,7 +93,6 @@ def optimise_robustly(
     def held(found) -> Held:
         return Held(float(np.asarray(found.holds).mean()), float(jnp.quantile(found.margins, quantile, method="lower")))
 
-    limit = scene.hand.torque_limit
     adam = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.05))
     share = start.values / limit
     state = adam.init(share)
@@ -113,6 +115,14 @@ def optimise_robustly(
         seen=(nominally, best_held),
         unseen=(held(tried(start, unseen)), held(tried(best, unseen))),
     )
+
+
+def _require_within(limit, torque: Torque) -> None:
+    """Raise ValueError for torques beyond their limits: the climb would keep them if they did best."""
+    most = np.abs(np.asarray(torque.values)).max(0)
+    for finger, (reached, allowed) in enumerate(zip(most, np.asarray(limit), strict=True), 1):
+        if reached > allowed * (1 + 1e-9):
+            raise ValueError(f"the nominal torque of finger {finger} is {reached:g} N m, its limit {allowed:g} N m")
 
 
 class _Climbed(NamedTuple):
