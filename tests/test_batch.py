@@ -2,7 +2,6 @@
 
 import inspect
 import sys
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -102,8 +101,13 @@ def test_what_follows_a_failure_must_be_known_as_well(scene, schedule):
     torque = padded(Torque(schedule.times, bent))
     errors = [float(one.table.error) for one in wa.trace(scene, resolution=QUICK.resolution, tolerance=1.0)]
     assert errors[0] < errors[1]
+
+    @jax.jit
+    def checked(limit):
+        return check_scene(scene, torque, ARRIVAL, QUICK._replace(error=limit))
+
     for limit, enough in ((np.sqrt(errors[0] * errors[1]), False), (2 * errors[1], True)):
-        answer, good = jax.jit(partial(check_scene, level=QUICK._replace(error=limit)))(scene, torque, ARRIVAL)
+        answer, good = checked(limit)
         assert int(answer.status) != Status.OK
         assert int(answer.phase) == 0
         assert bool(good) is enough

@@ -1,5 +1,6 @@
 """The condensed Newton step solves the whole system: every equation is written out here, densely, and looked at."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from wholearm_jax.stepping import Integration
 
 KNOTS = 7
 
+linearised, stepped = eqx.filter_jit(linearise), eqx.filter_jit(newton_step)
+
 
 def _problem(name, count, *, free):
     """A linearised problem of `count` phases at speed, its torques random; `free` lets durations change."""
@@ -26,7 +29,7 @@ def _problem(name, count, *, free):
     one, pinned = np.ones(count), np.zeros((count, KNOTS), bool)
     pinned[0, 0] = True
     limits = Limits(*map(array, (np.full(2, 40.0), one / (2 if free else 1), one, np.asarray(0.2), pinned, one)))
-    return linearise(p, tables, limits, Integration()), rng
+    return linearised(p, tables, limits, Integration()), rng
 
 
 def _dense(linear):
@@ -50,7 +53,7 @@ def test_a_condensed_step_solves_every_equation(name, count, free):
     assert np.all(np.isfinite(linear.at.room)), "the problem must be one that can be simulated"
     live = np.asarray(linear.at.weight) > 0
     stiff, aim = (np.where(live, rng.uniform(low, 1.0, live.shape), 0.0) for low in (0.1, -1.0))
-    way, level, prices = newton_step(linear, stiff, aim, 1e-3)
+    way, level, prices = stepped(linear, stiff, aim, 1e-3)
     jacobian, across = _dense(linear)
     bears = np.broadcast_to(linear.bears, live.shape).ravel()
     stiff, aim, moves = stiff.ravel(), aim.ravel(), ~np.asarray(linear.still)

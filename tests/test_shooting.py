@@ -78,11 +78,12 @@ def test_paces_bound_the_speed_between_knots(flip):
 def test_derivatives_of_an_interval_that_is_cut(flip):
     q, _ = _moving(flip)
 
+    @jax.jit
     def everything(q):
         shot = _shot(flip, 300, q)
         return jnp.concatenate([shot.forces.ravel(), shot.pace, shot.end])
 
-    exact = jax.jacfwd(everything)(q)
+    exact = jax.jit(jax.jacfwd(everything))(q)
 
     def slope(k, h):
         step = jnp.zeros(7).at[k].set(h)
