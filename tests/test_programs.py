@@ -173,9 +173,16 @@ def test_who_waits_makes_what_has_not_begun():
 
 
 @pytest.mark.usefixtures("no_calls_beside")
-def test_who_waits_for_what_is_beside_is_told_what_it_raised():
-    def fail():
-        raise ValueError("it cannot be compiled")
+def test_who_waits_is_told_what_was_raised_and_may_try_again():
+    tries = []
 
-    with pytest.raises(ValueError, match="cannot be compiled"):
-        programs.wait(programs.beside(fail))
+    def interrupted():
+        tries.append(1)
+        if len(tries) == 1:
+            raise KeyboardInterrupt("by who waits for it")
+
+    with pytest.raises(KeyboardInterrupt, match="who waits"):
+        programs.wait(programs.beside(interrupted))
+    programs.wait(programs.beside(interrupted))
+    programs.wait(programs.beside(interrupted))
+    assert len(tries) == 2

@@ -141,18 +141,22 @@ class Beside:
         except BaseException as raised:  # told to who waits for it
             self._done.set_exception(raised)
 
+    def failed(self) -> bool:
+        """Whether it was made and raised."""
+        return self._done.done() and self._done.exception() is not None
+
     def result(self) -> None:
         """Nothing, once it is made; raises what it raised."""
         self._done.result()
 
 
 def beside(function: Callable, *args, at_once: bool = False) -> Beside:
-    """Call a function in a thread of its own, once for every kind of arguments: after what was put beside before, and
-    as soon as the next program has been traced, or one waits for it; or `at_once`."""
+    """Call a function in a thread of its own, once for every kind of arguments unless it raises: after what was put
+    beside before, and as soon as the next program has been traced, or one waits for it; or `at_once`."""
     leaves, tree = jax.tree.flatten(args)
     kind = [(leaf.shape, leaf.dtype) if isinstance(leaf, ARRAYS) else (type(leaf), leaf) for leaf in leaves]
     key = function, tree, tuple(kind)
-    if key not in _calls_beside:
+    if key not in _calls_beside or _calls_beside[key].failed():
         _calls_beside[key] = Beside(function, args)
         _waiting.append(_calls_beside[key])
         if at_once:
