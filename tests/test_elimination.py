@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wholearm_jax.elimination import inverse, solve
+from wholearm_jax.elimination import crossed, inverse, solve
 
 
 @pytest.mark.parametrize("n", [1, 4, 5])
@@ -45,3 +45,18 @@ def test_a_singular_matrix_shows():
     inverted, determinant = inverse(jnp.zeros((5, 5)).at[0, 0].set(1.0))
     assert determinant == 0
     assert not np.all(np.isfinite(inverted))
+
+
+def test_what_is_orthogonal_to_four_rows():
+    rng = np.random.default_rng(3)
+    rows, other = rng.normal(size=(200, 4, 5)), rng.normal(size=(200, 5))
+    across = jax.vmap(crossed)(rows)
+    np.testing.assert_allclose(jnp.einsum("nij,nj->ni", rows, across), 0.0, atol=1e-13)
+    whole = np.concatenate([rows, other[:, None]], axis=1)
+    np.testing.assert_allclose((across * other).sum(1), np.linalg.det(whole), rtol=1e-10, atol=1e-13)
+
+
+def test_nothing_is_across_rows_that_depend_on_one_another():
+    rows = np.random.default_rng(4).normal(size=(4, 5))
+    rows[3] = rows[0] - 2 * rows[1] + rows[2]
+    np.testing.assert_allclose(crossed(jnp.asarray(rows)), 0.0, atol=1e-14)

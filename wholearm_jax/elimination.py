@@ -1,12 +1,15 @@
-r"""Eliminate: inverses and determinants of the small square matrices that every place of a wire needs.
+r"""Eliminate: inverses and determinants of the small matrices that every place of a wire needs.
 
 Gauss-Jordan elimination with row pivoting, as plain array operations, which a batch runs side by side. LAPACK's batched
 routines, as JAX calls them on processors, wait inside the pool of threads that they run on: on two processors a program
 with two of them may wait for ever (seen with jaxlib 0.10.2).
 """
 
+import itertools
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 
@@ -48,6 +51,32 @@ def _rate(primals, tangents):
     inverted, determinant = _eliminated(matrix)
     relative = times(inverted, rate)
     return (inverted, determinant), (-times(relative, inverted), determinant * jnp.trace(relative))
+
+
+def crossed(rows: Float[Array, "4 5"]) -> Float[Array, "5"]:
+    """What is orthogonal to four rows: its product with any other row is the determinant of all five.
+
+    Each component is a determinant of four columns, by products of minors of the first and the last two rows (Laplace):
+    nothing is divided by, and rows that depend on one another give zero.
+    """
+    first, second = _PAIRS.T
+    upper, lower = (one[first] * other[second] - one[second] * other[first] for one, other in (rows[:2], rows[2:]))
+    return (_SIGNS * upper[_UPPER] * lower[_LOWER]).sum(1)
+
+
+def _laplace() -> tuple[np.ndarray, ...]:
+    """Pairs of columns, and for each column left out: which pairs' minors are multiplied, with which signs."""
+    pairs = list(itertools.combinations(range(5), 2))
+    terms = []
+    for out in range(5):
+        for pair in (p for p in pairs if out not in p):
+            rest = tuple(k for k in range(5) if k != out and k not in pair)
+            sign = np.linalg.det(np.eye(5)[[*pair, *rest, out]])
+            terms.append((pairs.index(pair), pairs.index(rest), np.rint(sign)))
+    return np.array(pairs), *(np.array(column).reshape(5, 6) for column in zip(*terms, strict=True))
+
+
+_PAIRS, _UPPER, _LOWER, _SIGNS = _laplace()
 
 
 def times(matrix: Float[Array, "m n"], right: Float[Array, "n *columns"]) -> Float[Array, "m *columns"]:

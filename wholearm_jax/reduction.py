@@ -24,7 +24,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.contacts import constraint_rows, slip_rows
-from wholearm_jax.elimination import inverse, times
+from wholearm_jax.elimination import crossed, inverse, times
 from wholearm_jax.lookup import pick
 from wholearm_jax.newton import along_wire
 from wholearm_jax.precision import array, digits
@@ -102,18 +102,18 @@ def reduce_wire(system: System, wire: Wire) -> Table:
         x, bend = along.x, along.bend
         matrix, right = balance(system, z, x, bend, slip_sign, joint_sign)
         back, resting = balance(system, z, x, bend, -slip_sign, -joint_sign)
-        # Friction may turn the determinant's sign only by passing through a singular matrix.
-        inverted, determinants = jax.vmap(inverse)(jnp.stack([matrix, back]))
-        with_friction, turned = stop_gradient(determinants)
-        # Without friction, det [M x, -G^T] = x.M x det [G; u]: of M x only the part along x is not in the span of G^T.
+        ahead, with_friction = inverse(matrix)
+        # Friction may turn the determinant's sign only by passing through a singular matrix. Without friction,
+        # det [M x, -G^T] = x.M x det [G; u]: of M x only the part along x is not in the span of G^T.
         without = stop_gradient(system.inertia @ x**2 * along.determinant)
-        upright = with_friction * without
-        ahead, behind = inverted[0], inverted[1, 0]
+        upright = stop_gradient(with_friction) * without
         solution = times(ahead, right)
-        behind = times(resting[:, jnp.array([0, 3, 4])].T, behind)
+        # Orthogonal to the contacts' wrenches nothing but M x a is left.
+        across = crossed(back[:, 1:].T)
+        behind = times(resting[:, jnp.array([0, 3, 4])].T, across) * (across @ back[:, 0]) / without**2
         condition = jnp.abs(matrix).sum(0).max() * jnp.abs(ahead).sum(0).max()
         entry = ahead * system.inertia
-        return entry, (x, solution[0], solution[1:], behind * (turned / without) ** 2, condition, upright)
+        return entry, (x, solution[0], solution[1:], behind, condition, upright)
 
     entry, found = jax.vmap(node)(place, chart, xi, turn)
     x, ahead, force, behind, condition, upright = (a[:-1].reshape(*shape, *a.shape[1:]) for a in found)
