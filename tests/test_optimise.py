@@ -1,5 +1,8 @@
 """The main job: optimised plans against the certified bound, their limits, and the search by steps of 10 %."""
 
+import threading
+import time
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -51,6 +54,26 @@ def test_history_says_what_happened(optimised):
         assert [step.step for step in steps if step.start == 0] == list(range(sum(s.start == 0 for s in steps)))
         ends = [step for step in steps if step.apart < JOINED and step.temperature <= COLDEST]
         assert phase.margin == pytest.approx(max(step.margin for step in ends), rel=3e-3), "samples of joined intervals"
+
+
+def test_phases_side_by_side_are_what_each_is_alone(optimised):
+    """Whoever listens hears one step at a time."""
+    _, scene, both = optimised
+    heard, listening = [], threading.Lock()
+
+    def hear(step):
+        assert listening.acquire(blocking=False)
+        time.sleep(1e-4)
+        heard.append((step.phase, step.start, step.step, step.margin))
+        listening.release()
+
+    wires = tuple(phase.traced for phase in both.result.phases)
+    again = wa.optimise(scene, traced=wires, callback=hear)
+    assert sorted(heard) == sorted((s.phase, s.start, s.step, s.margin) for s in again.history)
+    rows = both.torque.values.reshape(len(wires), -1, 2)
+    for phase, wire, values in zip(scene.phases, wires, rows, strict=True):
+        alone = wa.optimise(eqx.tree_at(lambda s: s.phases, scene, (phase,)), traced=(wire,))
+        assert np.array_equal(alone.torque.values, values)
 
 
 def test_the_search_is_beaten_in_margin(optimised):

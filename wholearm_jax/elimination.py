@@ -70,9 +70,9 @@ def _laplace() -> tuple[np.ndarray, ...]:
     terms = []
     for out in range(5):
         for pair in (p for p in pairs if out not in p):
-            rest = tuple(k for k in range(5) if k != out and k not in pair)
-            sign = np.linalg.det(np.eye(5)[[*pair, *rest, out]])
-            terms.append((pairs.index(pair), pairs.index(rest), np.rint(sign)))
+            one, other = (k for k in range(5) if k != out and k not in pair)
+            sign = np.linalg.det(np.eye(5)[[*pair, one, other, out]])
+            terms.append((pairs.index(pair), pairs.index((one, other)), np.rint(sign)))
     return np.array(pairs), *(np.array(column).reshape(5, 6) for column in zip(*terms, strict=True))
 
 

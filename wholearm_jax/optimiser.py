@@ -1,14 +1,18 @@
 """Optimise: the torque schedule of a plan with the largest compressive margin.
 
 Phases that begin and end at rest have each their own problem; those that follow one another at speed have one together;
-those that hold the object have the best torque of its statics (`holding`).
+those that hold the object have the best torque of its statics (`holding`). Problems are solved side by side.
 It starts from the quasi-static torques of a smooth motion, descends (`pacing`) while the temperature of the smooth
 margin falls, and keeps the best schedule whose honest simulation succeeds.
 """
 
 import itertools
+import os
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -134,9 +138,10 @@ def optimise(
     times their phase's mean speed (wire over duration): an object that hardly moves where its formation changes may as
     well stop short of it. `optimiser` replaces the interior point by any optax optimiser (`descent.projected`). A phase
     stops when its margin comes within `tolerance` of the bound or no longer improves by that share, or after `steps`.
-    `callback` sees every step; `traced` reuses the result of `trace`. A phase that holds the object keeps its duration
-    and gets the best torque of its statics, approached and left as fast as `rate_limit` allows. Where no torque can
-    hold a formation, nothing is searched and the status says so.
+    `callback` sees every step, one at a time, but of several phases in no particular order: those that do not follow at
+    speed are descended on side by side, each in a thread of its own. `traced` reuses the result of `trace`. A phase
+    that holds the object keeps its duration and gets the best torque of its statics, approached and left as fast as
+    `rate_limit` allows. Where no torque can hold a formation, nothing is searched and the status says so.
 
     Derivation, section 9. Raises RuntimeError without float64, ValueError for fewer than two `knots`, and for numbers
     that are not positive.
@@ -158,7 +163,8 @@ def optimise(
         wait(*compiled)
     tops = bounds(scene, traced=traced)
     rows = _rows(scene, knots)
-    wanted = Wanted(knots, rows, steps, rate_limit, durations, passing, optimiser, tolerance, callback)
+    told = callback and _in_turn_called(callback)
+    wanted = Wanted(knots, rows, steps, rate_limit, durations, passing, optimiser, tolerance, told)
     found = []
     for lead in LEADS if rate_limit is not None else LEADS[:1]:
         found.append(_attempt(scene, traced, tops, wanted, lead))
@@ -174,28 +180,46 @@ def require_knots(knots: int) -> None:
 
 
 def _attempt(scene: Scene, traced, tops, wanted: Wanted, lead: float) -> Optimised:
-    """All phases one after the other, objects waiting at most a share `lead` of a phase before they set out."""
-    groups, found, history, stopped = _groups(scene), [], [], []
+    """All groups of phases side by side, objects waiting at most a share `lead` of a phase before they set out."""
+    groups = _groups(scene)
     changes: list[Handover | None] = [None] * (len(groups) - 1)
     if wanted.rate_limit is not None:
         changes = handovers(scene, groups, traced, tops, wanted.rate_limit, lead, wanted.durations)
-    for group, ends in zip(groups, itertools.pairwise([None, *changes, None]), strict=True):
-        parts = tuple(scene.phases[k] for k in group)
-        if parts[0].arrive == "hold":
-            found.append(steady(scene, parts[0], traced[group[0]], wanted.knots, wanted.rate_limit, *ends))
-            stopped.append("the best torque of a linear programme")
-            continue
-        one = Group(group[0], parts, [traced[k] for k in group], [tops[k] for k in group], *ends, wanted)
-        schedules, why, taken = optimise_group(scene, one)
-        found += schedules
-        stopped += [why] * len(group)
-        history += taken
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        one = partial(_part, scene, traced, tops, wanted)
+        parts = list(threads.map(one, groups, itertools.pairwise([None, *changes, None])))
+    found = [schedule for schedules, _, _ in parts for schedule in schedules]
+    stopped = [why for schedules, why, _ in parts for _ in schedules]
+    history = [step for *_, taken in parts for step in taken]
     lengths = [float(np.asarray(f.times)[-1]) for f in found]
     phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, lengths, strict=True))
     scene = eqx.tree_at(lambda s: s.phases, scene, phases)
     torque = in_turn(found)
     result = describe(scene, torque, traced, outcomes(scene, torque, traced, with_room(Integration(), wanted.knots)))
     return Optimised(scene, torque, result, tops, tuple(stopped), tuple(history))
+
+
+def _part(
+    scene: Scene, traced, tops, wanted: Wanted, group: list[int], ends: tuple[Handover | None, Handover | None]
+) -> tuple[list[Torque], str, list[Step]]:
+    """One group of phases, given how it takes over and hands over: schedules, why their descent stopped, its steps."""
+    phases, (begin, end) = tuple(scene.phases[k] for k in group), ends
+    if phases[0].arrive == "hold":
+        held = steady(scene, phases[0], traced[group[0]], wanted.knots, wanted.rate_limit, begin, end)
+        return [held], "the best torque of a linear programme", []
+    wires, most = [traced[k] for k in group], [tops[k] for k in group]
+    return optimise_group(scene, Group(group[0], phases, wires, most, begin, end, wanted))
+
+
+def _in_turn_called(callback: Callable[[Step], None]) -> Callable[[Step], None]:
+    """The same, called by one thread at a time."""
+    turn = threading.Lock()
+
+    def call(step: Step) -> None:
+        with turn:
+            callback(step)
+
+    return call
 
 
 def _lasting(scene: Scene, duration: float) -> Scene:
