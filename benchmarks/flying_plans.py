@@ -19,7 +19,6 @@ from random_plans import _grasps, random_object, write
 
 import wholearm_jax as wa
 from wholearm_jax.formations import Way, leaving, ways
-from wholearm_jax.phase import start_configuration
 from wholearm_jax.scene import Phase, formation, heading
 from wholearm_jax.scene_file import to_dict
 
@@ -53,7 +52,7 @@ def _from(grasp, shape, hand, phases):
     (traced,) = wa.trace(scene)
     if int(traced.table.status) != 0:
         return
-    z = start_configuration(traced.table)
+    z = traced.begin
     scene = eqx.tree_at(lambda s: s.start, scene, z)
     for chain in chains(scene, z, phases):
         yield scene, chain

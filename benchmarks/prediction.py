@@ -49,7 +49,7 @@ import wholearm_jax as wa
 from wholearm_jax.execution import Ending, Tolerance, execute, touching
 from wholearm_jax.free_bodies import CONVEX, Softness
 from wholearm_jax.palette import LINK_COLOURS as COLOURS
-from wholearm_jax.phase import destination, end_configuration, start_configuration
+from wholearm_jax.phase import destination
 from wholearm_jax.proportion import wilson
 from wholearm_jax.result import Result
 from wholearm_jax.sampling import sample
@@ -155,7 +155,7 @@ def _judged(phase, course, of) -> np.ndarray:
 
 def _pace(phase) -> float:
     """The mean speed of a phase [1/s]."""
-    way = np.asarray(end_configuration(phase.traced)) - np.asarray(start_configuration(phase.traced.table))
+    way = np.asarray(phase.traced.end) - np.asarray(phase.traced.begin)
     return float(np.linalg.norm(way / UNIT) / phase.duration)
 
 

@@ -22,7 +22,7 @@ import wholearm_jax as wa
 from wholearm_jax.forces import force, score
 from wholearm_jax.landing import acceleration
 from wholearm_jax.motion import move
-from wholearm_jax.phase import end_configuration, prepare
+from wholearm_jax.phase import prepare
 from wholearm_jax.reduction import on_panel, powers
 from wholearm_jax.sampling import SAMPLED, sample
 from wholearm_jax.scene import body
@@ -104,7 +104,7 @@ def rows(problem, repeats: int) -> list[dict]:
     """Every comparison on one phase: times of both sides [s] and their ratio."""
     table, seen, duration = problem.traced.table, problem.seen, problem.duration
     scene, phase = problem.scene, problem.scene.phases[problem.phase]
-    rough = end_configuration(wa.trace(scene)[problem.phase - 1]) if problem.phase else scene.start
+    rough = wa.trace(scene)[problem.phase - 1].end if problem.phase else scene.start
     solid = body(scene.object)
 
     def prepared(resolution):

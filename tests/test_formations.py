@@ -5,14 +5,13 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.formations import leaving, touching, ways
-from wholearm_jax.phase import end_configuration, start_configuration
 
 
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])
 def test_the_planned_phases_are_among_the_ways(name):
     scene = wa.load(name)
     traced = wa.trace(scene)
-    places = [start_configuration(traced[0].table), end_configuration(traced[0])]
+    places = [traced[0].begin, traced[0].end]
     tops = wa.bounds(scene, traced=traced)
     for phase, at, z, top in zip(scene.phases, traced, places, tops, strict=True):
         assert set(phase.formation.names) <= set(touching(scene, z))
@@ -20,13 +19,13 @@ def test_the_planned_phases_are_among_the_ways(name):
         length = float(at.table.length)
         way = min(same, key=lambda way: abs(way.length - length))
         assert way.length == pytest.approx(length, rel=1e-3), "charts begin with the same tangent"
-        np.testing.assert_allclose(way.end, end_configuration(at), atol=1e-9)
+        np.testing.assert_allclose(way.end, at.end, atol=1e-9)
         assert way.bound == pytest.approx(float(top.value), rel=1e-6)
 
 
 def test_a_fifth_contact_stops_the_ways_that_would_push_into_it():
     scene = wa.load("heptagon")
-    z = end_configuration(wa.trace(scene)[0])
+    z = wa.trace(scene)[0].end
     assert "finger2:v4" in touching(scene, z)
     old = [way for way in ways(scene, z) if set(way.contacts) == set(scene.phases[0].formation.names)]
     assert [way.toward for way in old] == ["x+"], "the slide cannot go on, only back"
@@ -35,7 +34,7 @@ def test_a_fifth_contact_stops_the_ways_that_would_push_into_it():
 def test_impacts_are_told():
     scene = wa.load("heptagon")
     end = wa.trace(scene)[0]
-    found = ways(scene, end_configuration(end), leaving(end.table))
+    found = ways(scene, end.end, leaving(end.table))
     flip = next(way for way in found if set(way.contacts) == set(scene.phases[1].formation.names))
     assert flip.entering in ("turns back", "pulls")
     onward = [way for way in found if way.entering.endswith("%")]

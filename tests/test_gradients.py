@@ -10,7 +10,6 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.gradient import torque_gradient
-from wholearm_jax.phase import end_configuration
 from wholearm_jax.plan import margin, steps_within
 from wholearm_jax.scene_file import to_dict
 from wholearm_jax.schedule import Torque
@@ -35,7 +34,7 @@ def one_phase(name, row, push, change=lambda data: None, duration=0.6):
     scene = wa.load(name)
     if row:
         end = wa.trace(scene)[0]
-        start = end_configuration(end)
+        start = end.end
         scene = eqx.tree_at(lambda s: (s.start, s.phases), scene, (start, scene.phases[row:]))
     data = to_dict(scene)
     data["phase"] = data["phase"][:1]

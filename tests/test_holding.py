@@ -10,7 +10,7 @@ import wholearm_jax as wa
 from wholearm_jax.execution import Ending, execute
 from wholearm_jax.handover import Handover, steady
 from wholearm_jax.holding import statics, watch
-from wholearm_jax.phase import balance_at_start, end_configuration, run, start_configuration
+from wholearm_jax.phase import balance_at_start, run
 from wholearm_jax.result_file import summary
 from wholearm_jax.scene import replace_duration
 from wholearm_jax.scene_file import to_dict
@@ -176,7 +176,7 @@ def test_slide_hold_flip(slide_hold_flip, optimised):
     assert optimised.result.margin == min(slide.margin, flip.margin)
     assert optimised.result.hold_margin == pause.margin > 2.0
     assert optimised.reached[1] == pytest.approx(1.0, abs=0.011)
-    np.testing.assert_allclose(start_configuration(traced[2].table), end_configuration(traced[0]), atol=1e-9)
+    np.testing.assert_allclose(traced[2].begin, traced[0].end, atol=1e-9)
     (held,) = pause.holds
     assert (held.start, held.end, held.lost) == (1.0, 1.5, None)
     course = wa.trajectory(optimised.result)[1]
@@ -193,7 +193,7 @@ def test_executed_on_free_bodies(optimised):
     done = execute(optimised.result)
     assert done.ending is Ending.OK
     at_rest = (done.course.time > 1.0) & (done.course.time < 1.5)
-    end = end_configuration(optimised.result.phases[0].traced)
+    end = optimised.result.phases[0].traced.end
     off = done.course.z[at_rest, :2] - np.asarray(end)[:2]
     assert np.hypot(*off.T).max() < 5e-4
 

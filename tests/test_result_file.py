@@ -9,7 +9,6 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from wholearm_jax.phase import end_configuration
 from wholearm_jax.plan import simulate
 from wholearm_jax.result_file import read_torque, summary, write_summary, write_torque, write_trajectory
 from wholearm_jax.scene_file import SceneError, load, parse, to_dict
@@ -132,7 +131,7 @@ def test_trajectory_ends_each_phase_where_its_wire_ends(pushed, tmp_path):
         last = rows[11 * k + 10]
         assert float(last["t"]) == pytest.approx(phase.start + phase.duration)
         there = numbers(last, ("x", "y", "phi", "theta1", "theta2"))
-        np.testing.assert_allclose(there, end_configuration(phase.traced), rtol=0, atol=1e-8)
+        np.testing.assert_allclose(there, phase.traced.end, rtol=0, atol=1e-8)
     assert float(rows[10]["x"]) == pytest.approx(0.0, abs=1e-9)
 
 

@@ -16,7 +16,7 @@ from wholearm_jax.contacts import frames, gaps
 from wholearm_jax.forces import REFINED, SAMPLES, arc, score
 from wholearm_jax.march import Watched, crossings
 from wholearm_jax.motion import move
-from wholearm_jax.phase import end_configuration, ending, prepare
+from wholearm_jax.phase import ending, prepare
 from wholearm_jax.plan import outcomes
 from wholearm_jax.reduction import balance, blank, on_panel, powers
 from wholearm_jax.scene import body
@@ -116,7 +116,7 @@ def test_derivatives_pass_from_chart_to_chart():
         at = wa.trace(moved)
         found = outcomes(moved, torque, at, Integration(adjoint=adjoint, tolerance=jnp.asarray(1e-12)))[0]
         share = found.motion.share[found.motion.count]
-        return jnp.concatenate([end_configuration(at[0]), jnp.stack([share, found.score.margin])])
+        return jnp.concatenate([at[0].end, jnp.stack([share, found.score.margin])])
 
     def moved(h):
         return outcome(jax.tree.map(lambda at, along: at + h * along, inputs, way), "none")
@@ -146,7 +146,7 @@ def test_a_wire_that_meets_another_is_singular():
 def test_wedging_on_the_way_back_does_not_spoil_the_table():
     """Backward accelerations keep their sign through a place where friction would wedge an object going back."""
     name = wa.load("heptagon")
-    end = end_configuration(wa.trace(name)[1])
+    end = wa.trace(name)[1].end
     rough = eqx.tree_at(lambda s: s.object.friction, name, jnp.full(3, 0.7))
     phase = rough.phases[1]
     heading = eqx.tree_at(lambda h: h.sign, phase.heading, -phase.heading.sign)
@@ -291,7 +291,7 @@ def test_the_hand_s_corners_stop_the_object(offset, corner):
     traced = wa.trace(tipping)[0]
     assert int(traced.table.status) == wa.Status.OK
     assert ending(traced, tipping.phases[0], 8) == f"e1 meets {corner}"
-    x, y, phi, theta, _ = np.asarray(end_configuration(traced))
+    x, y, phi, theta, _ = np.asarray(traced.end)
     met = np.array([0.8, 0.0]) + max(offset, 0.0) * np.array([-np.sin(theta), np.cos(theta)])
     across = np.array([np.cos(phi), np.sin(phi)]) @ (met - [x, y])
     assert across == pytest.approx(0.3, abs=1e-12)

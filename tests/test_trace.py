@@ -8,7 +8,7 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.contacts import gaps, normal_rows, slip_rows
-from wholearm_jax.phase import end_configuration, ending, prepare
+from wholearm_jax.phase import ending, prepare
 from wholearm_jax.reduction import combined, on_panel, powers
 from wholearm_jax.scene import body
 from wholearm_jax.scene_file import to_dict
@@ -90,7 +90,7 @@ def test_a_wire_that_ends_at_a_kink_keeps_its_friction(beyond):
     panel, xi = powers(whole.table, jnp.asarray(0), whole.table.breaks[1])
     kink = on_panel(whole.table.configuration, panel, xi)
     speed = on_panel(whole.table.velocity, panel, xi)
-    data["start"] = dict(zip(data["start"], end_configuration(wa.trace(wa.load("heptagon"))[0]).tolist(), strict=True))
+    data["start"] = dict(zip(data["start"], wa.trace(wa.load("heptagon"))[0].end.tolist(), strict=True))
     data["phase"] = [data["phase"][1] | {"until": {"phi": float(kink[2] + beyond * jnp.sign(speed[2]))}}]
     at = wa.trace(wa.parse(data))[0]
     table, last = at.table, int(at.table.count) - 1
@@ -103,15 +103,15 @@ def test_a_wire_that_ends_at_a_kink_keeps_its_friction(beyond):
 def test_until_ends_a_phase_early():
     at = wa.trace(changed("heptagon", until={"x": -0.01}))[0]
     assert int(at.table.status) == wa.Status.OK
-    assert float(end_configuration(at)[0]) == pytest.approx(-0.01, abs=1e-12)
+    assert float(at.end[0]) == pytest.approx(-0.01, abs=1e-12)
 
 
 def test_the_other_way_along_the_wire():
     ahead, back = wa.trace(changed("heptagon"))[0], wa.trace(changed("heptagon", toward="x+"))[0]
     panel, xi = powers(ahead.table, jnp.asarray(0), ahead.table.breaks[0])
     start = float(on_panel(ahead.table.configuration, panel, xi)[0])
-    assert float(end_configuration(ahead)[0]) < start - 0.01
-    assert float(end_configuration(back)[0]) > start + 0.001
+    assert float(ahead.end[0]) < start - 0.01
+    assert float(back.end[0]) > start + 0.001
 
 
 def test_a_start_that_no_contact_can_reach_is_refused_by_status():
@@ -177,7 +177,7 @@ def test_a_vertex_leaves_the_palm_where_it_ends(toward, contact, x):
     (traced,) = wa.trace(scene)
     assert int(traced.table.status) == wa.Status.OK
     assert ending(traced, scene.phases[0], 8) == f"{contact} leaves its feature"
-    z = np.asarray(end_configuration(traced))
+    z = np.asarray(traced.end)
     np.testing.assert_allclose(z[:3], [x, 0.03, 0.0], atol=1e-12)
 
 
@@ -236,7 +236,7 @@ def test_a_table_knows_its_error(phase):
 
 def traced_with(scene, phase, panels):
     """One phase's table, not refined."""
-    told, rough = scene.phases[phase], scene.start if phase == 0 else end_configuration(wa.trace(scene)[0])
+    told, rough = scene.phases[phase], scene.start if phase == 0 else wa.trace(scene)[0].end
     resolution = Resolution(panels=panels)
     return prepare(body(scene.object), scene.hand, scene.gravity, told.formation, rough, told.heading, resolution).table
 

@@ -101,14 +101,13 @@ def traced_or_refused(name: str, scene):
 
 def _note_unreached(name: str, scene, traced) -> None:
     """Say where a phase ends before its `until`."""
-    from wholearm_jax.phase import end_configuration, start_configuration
     from wholearm_jax.scene import COORDINATES
     from wholearm_jax.wire import UNTIL
 
     for k, (phase, at) in enumerate(zip(scene.phases, traced, strict=True)):
         which = int(phase.heading.until_coordinate)
         if which >= 0 and int(at.table.status) == 0 and int(at.wire.end_why) != UNTIL:
-            begin, end = (float(z[which]) for z in (start_configuration(at.table), end_configuration(at)))
+            begin, end = (float(z[which]) for z in (at.begin, at.end))
             wanted = f"{COORDINATES[which]} = {float(phase.heading.until_value):.6g}"
             note(f"{name}: phase[{k}].until: {wanted} is not on its wire, which leads from {begin:.6g} to {end:.6g}")
 

@@ -237,11 +237,11 @@ def formations(
     from rich.table import Table
 
     from wholearm_jax.formations import leaving, touching, ways
-    from wholearm_jax.phase import destination, start_configuration
+    from wholearm_jax.phase import destination
 
     traced = traced_or_refused(scene, loaded)
     if after is None:
-        z, z_dot = start_configuration(traced[0].table), None
+        z, z_dot = traced[0].begin, None
     else:
         row = phase_number(loaded, after)
         if row is None:

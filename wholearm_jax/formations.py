@@ -15,13 +15,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wholearm_jax.contacts import every_contact, frames, normal_rows
-from wholearm_jax.phase import Traced, end_configuration, ending, prepare
+from wholearm_jax.phase import Traced, ending, prepare
+from wholearm_jax.precision import array
 from wholearm_jax.reduction import Table, change, on_panel, powers
 from wholearm_jax.scene import COORDINATES, Phase, Scene, body, contact_name, formation, heading
 from wholearm_jax.squeeze import Bound, bound, hold
 from wholearm_jax.status import Status
 from wholearm_jax.system import system
 from wholearm_jax.verdict import PULL
+from wholearm_jax.wire import Resolution
 
 TOUCHING = 1e-7  # gap, in the object's radius, below which a contact touches
 SHORTEST = 1e-3  # wire length, in the object's radius, below which a way leads nowhere
@@ -120,7 +122,8 @@ def _rows(scene, z, chosen):
 def _way(scene, z, z_dot, names, chosen, toward: str) -> Way | None:
     """Trace one way; None where it leads nowhere."""
     onward = heading(toward)
-    traced = prepare(body(scene.object), scene.hand, scene.gravity, chosen, z, onward)
+    told, plain = (body(scene.object), scene.hand, scene.gravity, chosen, z, onward), array(True)
+    traced = prepare(*told, Resolution(), plain, plain)  # as `trace` does: one program
     table = traced.table
     status, length = Status(int(table.status)), float(table.length)
     if status is Status.OK and length < SHORTEST:
@@ -136,7 +139,7 @@ def _way(scene, z, z_dot, names, chosen, toward: str) -> Way | None:
         status=status,
         length=length,
         ends=ending(traced, phase, scene.object.vertices.shape[0]) if known else status.label,
-        end=end_configuration(traced),
+        end=traced.end,
         static=static,
         bound=top,
         speed=float(entered.speed),

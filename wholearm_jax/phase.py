@@ -15,7 +15,7 @@ from wholearm_jax.contacts import GROUPS, PALM_END, ROOT
 from wholearm_jax.forces import Score, score
 from wholearm_jax.holding import Departure, Statics, statics
 from wholearm_jax.motion import Motion, move
-from wholearm_jax.precision import array, given
+from wholearm_jax.precision import array, digits, given
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Change, Table, blank, change, on_panel, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, contact_name
@@ -26,14 +26,17 @@ from wholearm_jax.system import system
 from wholearm_jax.verdict import ARRIVAL, GOALS, Verdict, judge
 from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
 
+CONTINUITY = 1e-6  # metres and radians by which a phase may begin beside the end of the one before it
 NOWHERE = 1e-9  # length [object radii] of a wire that ends where it begins
 
 
 class Traced(NamedTuple):
-    """A phase's wire and its table."""
+    """A phase's wire and its table, and `z` (SI) where the wire begins and ends."""
 
     wire: Wire
     table: Table
+    begin: Float[Array, "5"]
+    end: Float[Array, "5"]
 
 
 class Outcome(NamedTuple):
@@ -50,12 +53,31 @@ class Outcome(NamedTuple):
 
 
 @Program
-def prepare(scene_body, hand, gravity, formation, rough, heading, resolution: Resolution = Resolution()) -> Traced:
-    """Trace a formation's wire from a rough start (SI) and tabulate its reduced dynamics."""
+def prepare(
+    scene_body, hand, gravity, formation, rough, heading, resolution: Resolution = Resolution(), first=True, holds=True
+) -> Traced:
+    """Trace a formation's wire from a rough start (SI) and tabulate its reduced dynamics.
+
+    But for the `first` phase of a plan its formation must hold where the phase before it ended, at `rough`; unless it
+    only `holds` the object, its wire must not end where it begins. Else the status refuses it.
+    """
     mechanics = system(scene_body, hand, gravity, formation)
     wire = trace_wire(mechanics, rough, heading, resolution)
+    table = reduce_wire(mechanics, wire)
+    begin = start_configuration(table)
+    end = configuration(table, table.count - 1, table.breaks[-1])
+    table = eqx.tree_at(lambda t: t.status, table, _joined(table, jnp.abs(begin - rough).max(), first, holds))
     # Weak types, which depend on how a constant was written, would make a second program of the next one.
-    return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), Traced(wire, reduce_wire(mechanics, wire)))
+    return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), Traced(wire, table, begin, end))
+
+
+def _joined(table: Table, apart: Float[Array, ""], first, holds) -> Int[Array, ""]:
+    """The status of a table, with that of a wire that does not join the one before or leads nowhere."""
+    known = table.status == int(Status.OK)
+    open_there = known & ~jnp.asarray(first) & ~(apart < max(CONTINUITY, digits(apart, 5 / 8)))
+    nowhere = known & ~jnp.asarray(holds) & (table.length < NOWHERE)
+    refused = [int(Status.NO_CONVERGENCE), int(Status.LEFT_FORMATION)]
+    return jnp.select([open_there, nowhere], refused, table.status)
 
 
 def run(
@@ -107,12 +129,6 @@ def configuration(table: Table, piece: Int[Array, ""], s: Float[Array, ""]) -> F
 
 
 @jax.jit
-def end_configuration(traced: Traced) -> Float[Array, "5"]:
-    """`z` (SI) where a wire ends."""
-    return configuration(traced.table, traced.table.count - 1, traced.table.breaks[-1])
-
-
-@jax.jit
 def start_configuration(table: Table) -> Float[Array, "5"]:
     """`z` (SI) where a wire starts."""
     return configuration(table, jnp.asarray(0, int), table.breaks[0])
@@ -125,7 +141,7 @@ def final_configuration(table: Table, motion: Motion) -> Float[Array, "5"]:
 
 def destination(phase: Phase, traced: Traced) -> Float[Array, "5"]:
     """`z` (SI) where a phase should end: at its wire's end, or where it began if it holds the object."""
-    return start_configuration(traced.table) if phase.arrive == "hold" else end_configuration(traced)
+    return traced.begin if phase.arrive == "hold" else traced.end
 
 
 def balance_at_start(scene: Scene, phase: Phase, traced: Traced) -> tuple[Statics, Departure]:
@@ -133,7 +149,7 @@ def balance_at_start(scene: Scene, phase: Phase, traced: Traced) -> tuple[Static
     table = traced.table
     panel, xi = powers(table, jnp.asarray(0, int), table.breaks[0])
     ahead, behind = jax.device_get((on_panel(table.acceleration, panel, xi), on_panel(table.backward, panel, xi)))
-    balance = statics(scene, phase.formation, start_configuration(table))
+    balance = statics(scene, phase.formation, traced.begin)
     return balance, Departure(ahead[[0, 3, 4]], behind)
 
 

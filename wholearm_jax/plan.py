@@ -15,17 +15,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wholearm_jax.phase import (
-    NOWHERE,
     Outcome,
     Traced,
     destination,
-    end_configuration,
     prepare,
     run,
     run_blank,
-    start_configuration,
 )
-from wholearm_jax.precision import array, digits
+from wholearm_jax.precision import array
 from wholearm_jax.programs import Beside, beside, transformed, wait
 from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result, describe
@@ -37,7 +34,6 @@ from wholearm_jax.verdict import ARRIVAL, GOALS
 from wholearm_jax.wire import Resolution
 
 ROUNDING = 1e4  # of a precision's last digit, the interpolation error that more panels do not make smaller
-CONTINUITY = 1e-6  # metres and radians by which a phase may begin beside the end of the one before it
 
 
 def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: float = 1e-9) -> tuple[Traced, ...]:
@@ -59,11 +55,12 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
         return _apart(traced_together(scene, resolution), len(scene.phases))
     solid, rough, found = body(scene.object), scene.start, []
     for phase in scene.phases:
-        traced = _refined(solid, scene, phase, rough, resolution, tolerance)
+        begin = rough, array(not found)
+        traced = _refined(solid, scene, phase, *begin, resolution, tolerance)
         if phase.arrive == "hold" and int(traced.table.status) != Status.OK:
             other = eqx.tree_at(lambda p: p.heading.sign, phase, -phase.heading.sign)
-            traced = _refined(solid, scene, other, rough, resolution, tolerance)
-        found.append(joined(traced, rough, array(not found), array(phase.arrive == "hold")))
+            traced = _refined(solid, scene, other, *begin, resolution, tolerance)
+        found.append(traced)
         rough = destination(phase, traced)
     return tuple(found)
 
@@ -76,10 +73,8 @@ def traced_together(scene: Scene, resolution: Resolution) -> Traced:
     def one(at, phase):
         """Trace a phase from where the one before it ended."""
         (rough, first), (formation, heading, holds) = at, phase
-        alone = prepare(solid, scene.hand, scene.gravity, formation, rough, heading, resolution)
-        traced = joined(alone, rough, first, holds)
-        ends = jnp.where(holds, start_configuration(traced.table), end_configuration(traced))
-        return (ends, jnp.asarray(False)), traced
+        traced = prepare(solid, scene.hand, scene.gravity, formation, rough, heading, resolution, first, holds)
+        return (jnp.where(holds, traced.begin, traced.end), jnp.asarray(False)), traced
 
     told = stacked([(p.formation, p.heading, jnp.asarray(p.arrive == "hold")) for p in scene.phases])
     return jax.lax.scan(one, (scene.start, jnp.asarray(True)), told)[1]
@@ -95,22 +90,10 @@ def _apart(together, count: int) -> tuple:
     return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], together) for k in range(count))
 
 
-@jax.jit
-def joined(traced: Traced, rough, first, holds) -> Traced:
-    """Refuse a phase whose formation does not hold where the phase before it ended, or, unless it only `holds` the
-    object, whose wire ends where it begins."""
-    apart = jnp.abs(start_configuration(traced.table) - rough).max()
-    status = traced.table.status
-    known = status == int(Status.OK)
-    open_there = known & ~first & ~(apart < max(CONTINUITY, digits(apart, 5 / 8)))
-    nowhere = known & ~holds & (traced.table.length < NOWHERE)
-    status = jnp.where(open_there, int(Status.NO_CONVERGENCE), jnp.where(nowhere, int(Status.LEFT_FORMATION), status))
-    return eqx.tree_at(lambda t: t.table.status, traced, status)
-
-
-def _refined(solid, scene, phase: Phase, rough, resolution: Resolution, tolerance: float) -> Traced:
+def _refined(solid, scene, phase: Phase, rough, first, resolution: Resolution, tolerance: float) -> Traced:
+    told, holds = (phase.formation, rough, phase.heading), array(phase.arrive == "hold")
     while True:
-        traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, resolution)
+        traced = prepare(solid, scene.hand, scene.gravity, *told, resolution, first, holds)
         table = traced.table
         least_error = ROUNDING * jnp.finfo(table.breaks.dtype).eps
         coarse = float(table.error) > max(tolerance, least_error) and int(table.status) == Status.OK
