@@ -36,7 +36,7 @@ from wholearm_jax.linearisation import Limits, Linear, change_of_rooms, gather, 
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Table
 from wholearm_jax.shooting import PACES, PARTS, ROWS, Variables, samples_of
-from wholearm_jax.squeeze import coefficients
+from wholearm_jax.squeeze import acceleration_terms
 from wholearm_jax.stepping import Integration
 
 HOTTEST, COLDEST = 0.1, 1e-4  # temperatures, as shares of the bound
@@ -182,7 +182,7 @@ def moved(p: Variables, way: Variables, share, tables: Table, limits: Limits) ->
 
     def balance(table, state, log):
         """Acceleration in lengths a duration squared is `rest + pull . torque`, the squeeze `free . torque`."""
-        motion, _ = coefficients(table, table.breaks[0] + table.length * state[0])
+        motion = acceleration_terms(table, table.breaks[0] + table.length * state[0])
         time = jnp.exp(log)
         v = state[1] * table.length / time
         rest = motion[0] + motion[1] * v**2 + motion[2] * v

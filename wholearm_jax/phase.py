@@ -19,7 +19,7 @@ from wholearm_jax.precision import array, digits, given
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Change, Table, blank, change, on_panel, powers, reduce_wire
 from wholearm_jax.scene import Phase, Scene, contact_name
-from wholearm_jax.schedule import Torque, evenly, padded, window
+from wholearm_jax.schedule import Torque, evenly, window
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration, tolerance_as_data
 from wholearm_jax.system import system
@@ -118,7 +118,7 @@ def _run(table: Table, schedule: Torque, start, duration, arriving, how: Integra
 def run_blank(rows: int, how: Integration) -> None:
     """Run a phase under a schedule of so many rows, on a table of the usual size that has no wire: that compiles what
     runs those that have one (`programs.beside`)."""
-    run(blank(Resolution()), padded(evenly(1.0, np.zeros((rows, 2)))), array(0.0), array(1.0), how, "rest")
+    run(blank(Resolution()), evenly(1.0, np.zeros((rows, 2))), array(0.0), array(1.0), how, "rest")
 
 
 @jax.jit

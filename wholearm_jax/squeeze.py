@@ -9,6 +9,7 @@ Derivation: section 8 of `docs/derivation.md`.
 """
 
 import itertools
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -42,10 +43,18 @@ class Bound(eqx.Module):
 
 def coefficients(table: Table, s: Float[Array, ""]):
     """Coefficients of `a` (5) and of the forces (slots x 5) at `s`, in the piece that holds it."""
-    inner = table.breaks[1:-1]
-    piece = jnp.minimum((s >= inner).sum(), table.count - 1)
-    panel, xi = powers(table, piece, s)
+    panel, xi = _place(table, s)
     return on_panel(table.acceleration, panel, xi), on_panel(table.force, panel, xi)
+
+
+def acceleration_terms(table: Table, s: Float[Array, ""]) -> Float[Array, "5"]:
+    """Those of `a` alone."""
+    return on_panel(table.acceleration, *_place(table, s))
+
+
+def _place(table: Table, s):
+    inner = table.breaks[1:-1]
+    return powers(table, jnp.minimum((s >= inner).sum(), table.count - 1), s)
 
 
 def hold(table: Table, s, v=0.0, a=0.0) -> Hold:
@@ -92,27 +101,28 @@ def bound(table: Table, duration: Float[Array, ""], from_rest=True, to_rest=True
     fastest = FASTEST * table.length / duration
     speeds = fastest * jnp.linspace(0.0, 1.0, SPEEDS + 1) ** 2
     places = table.breaks[0] + table.length * jnp.linspace(0.0, 1.0, PLACES + 1)
+    motion, force = jax.vmap(partial(coefficients, table))(places)
+    still, square, linear, slope = (a[:, None] for a in _terms(jax.vmap(partial(linear_slacks, table))(force)))
 
-    def moving(s):
-        force = linear_slacks(table, coefficients(table, s)[1])
-
-        def between(low, high):
-            square = jnp.maximum(force[:, 1] * low**2, force[:, 1] * high**2)
-            linear = jnp.maximum(force[:, 2] * low, force[:, 2] * high)
-            return _best(table, force[:, 0] + square + linear, force[:, 3:], jnp.zeros(2), jnp.ones(()))
-
-        return jax.vmap(between)(speeds[:-1], speeds[1:]).max()
-
-    def resting(s, sign):
-        motion, force = coefficients(table, s)
-        force = linear_slacks(table, force)
-        return _best(table, force[:, 0], force[:, 3:], sign * motion[3:], sign * motion[0])
-
-    values = jax.vmap(moving)(places)
-    values = jnp.where(from_rest, values.at[0].set(resting(places[0], 1.0)), values)
-    values = jnp.where(to_rest, values.at[-1].set(resting(places[-1], -1.0)), values)
+    low, high = speeds[:-1, None], speeds[1:, None]
+    moving = still + jnp.maximum(square * low**2, square * high**2) + jnp.maximum(linear * low, linear * high)
+    ends, sign = jnp.array([0, PLACES]), jnp.array([1.0, -1.0])
+    count = moving.shape[0] * SPEEDS
+    best = jax.vmap(partial(_best, table))(
+        jnp.concatenate([moving.reshape(count, -1), still[ends, 0]]),
+        jnp.concatenate([jnp.repeat(slope[:, 0], SPEEDS, axis=0), slope[ends, 0]]),
+        jnp.concatenate([jnp.zeros((count, 2)), sign[:, None] * motion[ends, 3:]]),
+        jnp.concatenate([jnp.ones(count), sign * motion[ends, 0]]),
+    )
+    values = best[:count].reshape(-1, SPEEDS).max(1)
+    values = values.at[ends].set(jnp.where(jnp.stack([from_rest, to_rest]), best[count:], values[ends]))
     k = jnp.argmin(values)
     return Bound(values[k], places[k], k / PLACES)
+
+
+def _terms(force: Float[Array, "*places rows terms"]):
+    """Coefficients of 1, `v^2`, `v` and the torques."""
+    return force[..., 0], force[..., 1], force[..., 2], force[..., 3:]
 
 
 def _rows(slacks: int) -> Int[np.ndarray, "vertices 3"]:
