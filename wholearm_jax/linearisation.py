@@ -33,7 +33,7 @@ class Limits(eqx.Module):
     unit: Float[Array, "phases"]
 
 
-OF_PHASES = Limits(rate=None, shortest=0, longest=0, passing=None, pinned=0, unit=0)  # pyright: ignore
+OF_PHASES = Limits(rate=False, shortest=True, longest=True, passing=False, pinned=True, unit=True)  # pyright: ignore
 
 
 class Rooms(NamedTuple):
@@ -59,12 +59,18 @@ class Linear(NamedTuple):
 
 
 def rooms(q: Float[Array, "phases intervals 7"], tables: Table, limits: Limits, how: Integration) -> Rooms:
-    """All intervals of phases that follow one another at speed."""
+    """All intervals of phases that follow one another at speed, one phase after the other."""
     phases, intervals = q.shape[:2]
     slowest = jnp.zeros((phases, intervals)).at[:, 0].set(limits.passing).at[0, 0].set(-jnp.inf)
-    each = jax.vmap(jax.vmap(partial(_rooms, intervals), (0, 0, 0, None, None)), (0, 0, 0, 0, OF_PHASES))
-    shots = jax.vmap(lambda table, q: shoot(table, how, intervals, q))(tables, q)
-    return each(q, shots, slowest, tables, limits)
+    own, shared = eqx.partition(limits, OF_PHASES)
+
+    def one(phase):
+        q, slowest, table, own = phase
+        shots = shoot(table, how, intervals, q)
+        each = jax.vmap(partial(_rooms, intervals), (0, 0, 0, None, None))
+        return each(q, shots, slowest, table, eqx.combine(own, shared))
+
+    return jax.lax.map(one, (q, slowest, tables, own))
 
 
 def _rooms(intervals: int, q: Float[Array, "7"], shot: Shot, slowest, table: Table, limits: Limits) -> Rooms:
