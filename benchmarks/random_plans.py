@@ -159,7 +159,7 @@ def _held_to(plan: dict[str, Any], coordinate: int, least: float) -> str | None:
     """Why the last phase ends, if it can be followed and held over at least `least` of a coordinate; else None."""
     scene = wa.parse(plan)
     traced = wa.trace(scene)
-    wire, table = traced[-1]
+    wire, table = traced[-1].wire, traced[-1].table
     if int(table.status) or abs(float(wire.end[coordinate] - wire.start[coordinate])) < least:
         return None
     if not float(wa.bounds(scene, traced=traced)[-1].value) > LEAST_BOUND:
