@@ -147,13 +147,6 @@ def test_what_is_put_beside_is_called_once_for_each_kind_after_the_next_program_
 
 
 @pytest.mark.usefixtures("no_calls_beside")
-def test_what_need_not_wait_for_the_next_program_is_called_at_once():
-    made = threading.Event()
-    programs.beside(made.set, at_once=True)
-    assert made.wait(60)
-
-
-@pytest.mark.usefixtures("no_calls_beside")
 def test_who_waits_makes_what_has_not_begun():
     first_began, last_made, threads = threading.Event(), threading.Event(), []
 
@@ -165,7 +158,8 @@ def test_who_waits_makes_what_has_not_begun():
         threads.append(threading.current_thread())
         last_made.set()
 
-    calls = programs.beside(first, at_once=True), programs.beside(last)
+    calls = programs.beside(first), programs.beside(last)
+    call(power=11)
     assert first_began.wait(60)
     assert not last_made.is_set()
     programs.wait(*calls)

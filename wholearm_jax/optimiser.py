@@ -233,7 +233,7 @@ def optimise_beside(
 ) -> tuple[Beside, ...]:
     """Compile what `optimise` runs in a thread of its own, while wires are traced; it is to be waited for."""
     sizes = sorted({len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"})
-    squeezes = beside(_squeeze_blank, tuple(sizes), knots, at_once=True)
+    squeezes = beside(_squeeze_blank, tuple(sizes), knots)
     descents = [beside(_advance_blank, n, knots, descent_method(optimiser, n)) for n in sizes]
     return squeezes, *descents, beside(run_blank, _rows(scene, knots), with_room(Integration(), knots))
 

@@ -150,17 +150,15 @@ class Beside:
         self._done.result()
 
 
-def beside(function: Callable, *args, at_once: bool = False) -> Beside:
+def beside(function: Callable, *args) -> Beside:
     """Call a function in a thread of its own, once for every kind of arguments unless it raises: after what was put
-    beside before, and as soon as the next program has been traced, or one waits for it; or `at_once`."""
+    beside before, and as soon as the next program has been traced, or one waits for it."""
     leaves, tree = jax.tree.flatten(args)
     kind = [(leaf.shape, leaf.dtype) if isinstance(leaf, ARRAYS) else (type(leaf), leaf) for leaf in leaves]
     key = function, tree, tuple(kind)
     if key not in _calls_beside or _calls_beside[key].failed():
         _calls_beside[key] = Beside(function, args)
         _waiting.append(_calls_beside[key])
-        if at_once:
-            _start()
     return _calls_beside[key]
 
 

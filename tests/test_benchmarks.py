@@ -1,0 +1,39 @@
+"""What benchmarks share follows the package: random plans can be made, and are what they say."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+import wholearm_jax as wa
+
+
+@pytest.fixture
+def benchmarks(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    yield
+    for name in ("random_plans", "flying_plans"):
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.usefixtures("benchmarks")
+def test_random_plans_can_be_followed_and_held():
+    from random_plans import LEAST_BOUND, random_plans
+
+    (scene,) = random_plans(1, seed=3)
+    traced = wa.trace(scene)
+    assert [wa.Status(int(one.table.status)).label for one in traced] == ["ok", "ok"]
+    assert min(float(top.value) for top in wa.bounds(scene, traced=traced)) > LEAST_BOUND
+
+
+@pytest.mark.usefixtures("benchmarks")
+def test_random_plans_at_speed_lead_on():
+    from flying_plans import chains
+
+    from wholearm_jax.formations import leaving
+
+    scene = wa.load("flight")
+    traced = wa.trace(scene)
+    onward = list(chains(scene, traced[0].end, 1, leaving(traced[0].table)))
+    assert all(way.status is wa.Status.OK and way.bound > 0 for (way,) in onward)
+    assert scene.phases[1].formation.names in [tuple(way.contacts) for (way,) in onward]
