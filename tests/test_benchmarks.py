@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import wholearm_jax as wa
@@ -36,4 +37,6 @@ def test_random_plans_at_speed_lead_on():
     traced = wa.trace(scene)
     onward = list(chains(scene, traced[0].end, 1, leaving(traced[0].table)))
     assert all(way.status is wa.Status.OK and way.bound > 0 for (way,) in onward)
+    for (way,) in onward:
+        np.testing.assert_allclose(way.traced.begin, traced[0].end, atol=1e-9)
     assert scene.phases[1].formation.names in [tuple(way.contacts) for (way,) in onward]

@@ -119,16 +119,10 @@ def note(text: str) -> None:
 
 def note_limits(scene, schedule, torque: Path) -> None:
     """Say where a schedule asks for more than a joint's torque limit."""
-    import numpy as np
+    from wholearm_jax.schedule import beyond
 
-    times, values = np.asarray(schedule.times), np.abs(np.asarray(schedule.values))
-    for joint, limit in enumerate(np.asarray(scene.hand.torque_limit).tolist()):
-        worst = int(np.argmax(values[:, joint]))
-        if values[worst, joint] > limit * (1 + 1e-9):
-            size, when = values[worst, joint], times[worst]
-            note(
-                f"{torque}: |tau{joint + 1}| is {size:.4g} N m at t = {when:.4g} s, beyond the limit of {limit:.4g} N m"
-            )
+    for joint, size, when, limit in beyond(schedule, scene.hand.torque_limit):
+        note(f"{torque}: |tau{joint}| is {size:.4g} N m at t = {when:.4g} s, beyond the limit of {limit:.4g} N m")
 
 
 def predicted(scene, schedule, torque: Path, tolerance: float, traced):

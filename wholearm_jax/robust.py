@@ -26,7 +26,7 @@ from wholearm_jax.phase import Traced
 from wholearm_jax.plan import outcomes, require_covered, require_motion, roomy, steps_within, trace
 from wholearm_jax.programs import Program
 from wholearm_jax.requirements import require_positive
-from wholearm_jax.schedule import Torque
+from wholearm_jax.schedule import Torque, beyond
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
 from wholearm_jax.variation import Ensemble
@@ -117,12 +117,10 @@ def optimise_robustly(
     )
 
 
-def _require_within(limit, torque: Torque) -> None:
+def _require_within(limits, torque: Torque) -> None:
     """Raise ValueError for torques beyond their limits: the climb would keep them if they did best."""
-    most = np.abs(np.asarray(torque.values)).max(0)
-    for finger, (reached, allowed) in enumerate(zip(most, np.asarray(limit), strict=True), 1):
-        if reached > allowed * (1 + 1e-9):
-            raise ValueError(f"the nominal torque of finger {finger} is {reached:g} N m, its limit {allowed:g} N m")
+    for finger, reached, _, limit in beyond(torque, limits):
+        raise ValueError(f"the nominal torque of finger {finger} is {reached:g} N m, its limit {limit:g} N m")
 
 
 class _Climbed(NamedTuple):

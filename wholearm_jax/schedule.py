@@ -66,6 +66,15 @@ def evenly(duration, values) -> Torque:
     return Torque(array(np.linspace(0.0, float(duration), len(values))), array(values))
 
 
+def beyond(schedule: Torque, limits) -> list[tuple[int, float, float, float]]:
+    """Joints (1, 2) whose torque goes beyond its limit but for rounding, each with its largest magnitude [N m], when
+    that is [s], and its limit."""
+    times, sizes = np.asarray(schedule.times), np.abs(np.asarray(schedule.values))
+    worst = sizes.argmax(0)
+    told = zip((1, 2), sizes[worst, [0, 1]].tolist(), times[worst].tolist(), np.asarray(limits).tolist(), strict=True)
+    return [(joint, size, when, limit) for joint, size, when, limit in told if size > limit * (1 + 1e-9)]
+
+
 def in_turn(schedules: list[Torque]) -> Torque:
     """Schedules one after the other, each from time 0; a step where one follows another."""
     begins = np.cumsum([0.0, *(float(np.asarray(s.times)[-1]) for s in schedules[:-1])])

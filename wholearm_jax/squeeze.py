@@ -102,7 +102,8 @@ def bound(table: Table, duration: Float[Array, ""], from_rest=True, to_rest=True
     speeds = fastest * jnp.linspace(0.0, 1.0, SPEEDS + 1) ** 2
     places = table.breaks[0] + table.length * jnp.linspace(0.0, 1.0, PLACES + 1)
     motion, force = jax.vmap(partial(coefficients, table))(places)
-    still, square, linear, slope = (a[:, None] for a in _terms(jax.vmap(partial(linear_slacks, table))(force)))
+    force = jax.vmap(partial(linear_slacks, table))(force)[:, None]
+    still, square, linear, slope = force[..., 0], force[..., 1], force[..., 2], force[..., 3:]
 
     low, high = speeds[:-1, None], speeds[1:, None]
     moving = still + jnp.maximum(square * low**2, square * high**2) + jnp.maximum(linear * low, linear * high)
@@ -118,11 +119,6 @@ def bound(table: Table, duration: Float[Array, ""], from_rest=True, to_rest=True
     values = values.at[ends].set(jnp.where(jnp.stack([from_rest, to_rest]), best[count:], values[ends]))
     k = jnp.argmin(values)
     return Bound(values[k], places[k], k / PLACES)
-
-
-def _terms(force: Float[Array, "*places rows terms"]):
-    """Coefficients of 1, `v^2`, `v` and the torques."""
-    return force[..., 0], force[..., 1], force[..., 2], force[..., 3:]
 
 
 def _rows(slacks: int) -> Int[np.ndarray, "vertices 3"]:
