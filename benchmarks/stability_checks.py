@@ -91,8 +91,9 @@ class Units(NamedTuple):
         if "acceleration" in found:
             found["acceleration"] = found["acceleration"] * shaped(columns, found["acceleration"], 1)
             found["force"] = found["force"] * shaped(columns, found["force"], 1)
-        if "force" in found:
-            found["force"] = found["force"] / shaped(self.force, found["force"])
+        for key in ("force", "parts"):
+            if key in found:
+                found[key] = found[key] / shaped(self.force, found[key])
         return found
 
 
@@ -189,17 +190,20 @@ def end_is_real(model: Model, z, why, contact, until, tolerance) -> np.ndarray:
 def motion_residuals(model: Model, at) -> dict[str, np.ndarray]:
     """The five equations of motion at times, with the accelerations `x a + x' v^2` and forces of the result.
 
-    `at` holds `z`, `x`, `bend`, `a`, `v`, `torque` and `force` in object units, and the signs.
+    `at` holds `z`, `x`, `bend`, `a`, `v`, `torque`, `force` and its `parts` in object units, and the signs. Where
+    weight and torques all but cancel each other, an equation is judged against them, not against what is left.
     """
     z_dot = at["x"] * at["v"][..., None]
     z_ddot = at["x"] * at["a"][..., None] + at["bend"] * (at["v"] ** 2)[..., None]
     here = model.geometry(at["z"], z_dot)
-    contact = np.einsum("npic,npc->npi", model.wrench(here, at["slip"]), at["force"])
+    wrench = model.wrench(here, at["slip"])
+    contact = np.einsum("npic,npc->npi", wrench, at["force"])
+    parts = np.einsum("npic,npc->npi", np.abs(wrench), at["parts"])
     inertial = model.inertia[:, None] * z_ddot
     applied = model.applied(z_dot, at["torque"], at["joint"])
     held = np.einsum("npci,npi->npc", here.normal_rows, z_ddot) + here.left
     return {
-        "motion": relative(inertial - contact - applied, inertial, contact, applied, np.full_like(applied, 1e-30)),
+        "motion": relative(inertial - contact - applied, inertial, parts, applied, np.full_like(applied, 1e-30)),
         "constraint": np.abs(held).max(-1) / (np.abs(z_ddot).max(-1) + dot(z_dot, z_dot) + 1e-30),
     }
 

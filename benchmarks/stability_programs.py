@@ -141,7 +141,14 @@ def follow(wire: Wire, table: Table, scene: Scenes, how: Integration) -> Followe
         motion = {"v": w / scene.duration, "a": bend / scene.duration**2, "share": share}
         pushed = force(table, seen, scene.duration, arc.piece, arc.row, share, s, w)
         motion |= {"torque": torque_in(seen, arc.row, share), "force": pushed}
+        motion |= {"parts": magnitudes(arc, share, s, motion["v"])}
         return read(arc.piece, s) | motion | {"held": arc.held | ~arc.live}
+
+    def magnitudes(arc, share, s, v):
+        """What each force is the sum of, in magnitude: against that its table is exact."""
+        panel, xi = powers(table, arc.piece, s)
+        terms = jnp.concatenate([jnp.stack([jnp.ones_like(v), v**2, v]), torque_in(seen, arc.row, share)])
+        return jnp.abs(on_panel(table.force, panel, xi)) @ jnp.abs(terms)
 
     def moment(share):
         step = jnp.clip((share >= motion.share).sum() - 1, 0, last)

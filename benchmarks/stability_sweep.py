@@ -322,7 +322,7 @@ def check_motion(found, rows, model, units, result, limits):
     energy = checks.energy_residual(model, units.remove(result.ends), within, weights)
     found["energy"][rows] = np.where(moving, energy, np.nan)
     force = np.where((weights > 0)[..., None], within["force"], np.nan)
-    scale = np.nanmax(np.abs(force), axis=(1, 2), initial=0.0)
+    scale = np.where((weights > 0)[..., None], within["parts"], 0.0).max((1, 2))
     slack = model.slack(force)
     least = np.nanmin(slack, axis=(1, 2), initial=np.inf)
     margin = result.margin / units.force

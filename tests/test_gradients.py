@@ -7,12 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_trace import ending_at_its_kink
 
 import wholearm_jax as wa
+from wholearm_jax.forces import score
 from wholearm_jax.gradient import torque_gradient
+from wholearm_jax.motion import move
 from wholearm_jax.plan import margin, steps_within
 from wholearm_jax.scene_file import to_dict
-from wholearm_jax.schedule import Torque
+from wholearm_jax.schedule import Torque, window
 from wholearm_jax.stepping import Integration
 
 
@@ -110,3 +113,25 @@ def test_the_margin_is_that_of_the_simulation_whatever_it_will_be_differentiated
 
 def test_modes_and_differences_agree_along_random_directions(case):
     assert_modes_and_differences_agree(*case)
+
+
+@pytest.mark.parametrize("beyond", [1e-14, 2e-14, 1e-12])
+def test_a_margin_where_a_wire_ends_beside_a_kink_has_its_derivative(beyond):
+    """Forces at the wire's end do not depend on how long the phase might have gone on, however near to it a slip
+    reverses: there is no piece in which forces, and the place of the least, would vary by rounding alone."""
+    scene, _ = ending_at_its_kink(beyond)
+    torques = wa.torque([0.0, 1.0], [[1.5, -0.9], [-1.2, 0.0]])
+    how = Integration(adjoint="forward", tolerance=1e-10)
+    (traced,) = wa.trace(scene)
+
+    @jax.jit
+    def ends(duration):
+        seen = window(torques, jnp.asarray(0.0), duration)
+        motion = move(traced.table, seen, duration, how=how, speed=7.6)
+        found = score(traced.table, seen, duration, motion, how)
+        return found.margin, (found.share - motion.share[motion.count], motion.status)
+
+    _, change, (early, status) = jax.jvp(ends, (jnp.asarray(1.5),), (jnp.asarray(1.0),), has_aux=True)
+    assert int(status) == wa.Status.LEFT_FORMATION
+    assert abs(float(early)) < 1e-12, "the margin is not at the end: it is no test"
+    assert abs(float(change)) < 1e-7

@@ -19,6 +19,7 @@ from wholearm_jax.motion import move
 from wholearm_jax.phase import ending, prepare
 from wholearm_jax.plan import outcomes
 from wholearm_jax.reduction import balance, blank, on_panel, powers
+from wholearm_jax.sampling import sample
 from wholearm_jax.scene import body
 from wholearm_jax.schedule import window
 from wholearm_jax.squeeze import hold, holds
@@ -212,6 +213,22 @@ def test_a_step_as_short_as_rounding_keeps_its_speed():
     slope = np.polynomial.polynomial.polyder(np.asarray(quintic))
     speed = np.polynomial.polynomial.polyval(np.linspace(0, 1, 7), slope) / float(share[1] - share[0])
     np.testing.assert_allclose(speed, 1.5, rtol=1e-12)
+
+
+def test_a_step_that_takes_no_time_says_nothing():
+    """Where a motion ends twice, as by a landing within rounding of a step's end, forces are those of its speed."""
+    table, seen = track([0.0, 99.0], [1.0])
+    pulls_at_rest = jnp.zeros((1, 4, 4, 5)).at[0, 0, :, :2].set(jnp.array([-1.0, 1.0]))
+    table = eqx.tree_at(lambda t: t.force, table, pulls_at_rest)
+    motion = move(table, seen, jnp.asarray(1.0), how=Integration(), speed=4.0)
+    motion = motion._replace(entry_w=motion.entry_w.at[motion.count].set(4.0), count=motion.count + 1)
+    assert float(motion.share[motion.count - 1]) == float(motion.share[motion.count]) == 1.0
+    found = score(table, seen, jnp.asarray(1.0), motion, Integration())
+    assert float(found.margin) == pytest.approx(15.0, rel=1e-12)
+    assert float(found.lost) == np.inf
+    schedule = wa.torque([0.0, 1.0], np.zeros((2, 2)))
+    course = sample(table, schedule, jnp.asarray(0.0), jnp.asarray(1.0), motion, jnp.array([0.5, 1.0]))
+    np.testing.assert_allclose(course.cn, 15.0, rtol=1e-12)
 
 
 @pytest.mark.parametrize("floor", [0.3, -1e-3])

@@ -63,7 +63,8 @@ class Arcs(eqx.Module):
 
 def arcs(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion) -> Arcs:
     """The steps of a motion as arcs."""
-    live = jnp.arange(motion.held.shape[0]) < motion.count
+    # A step that takes no time has no speed of its own: its neighbours hold what is before it and behind.
+    live = (jnp.arange(motion.held.shape[0]) < motion.count) & (motion.share[1:] > motion.share[:-1])
     share, s = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (motion.share, motion.s))
     w = jnp.stack([motion.entry_w, motion.w[1:]], axis=1)
     each = jax.vmap(arc, (None, None, None, 0, 0, 0, 0, 0, 0))

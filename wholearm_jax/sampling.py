@@ -48,8 +48,10 @@ def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shar
     seen = window(schedule, start, duration)
     steps = arcs(table, seen, duration, motion)
 
+    rows = jnp.arange(steps.live.shape[0])
+
     def one(share):
-        k = jnp.clip((share >= motion.share).sum() - 1, 0, jnp.maximum(motion.count - 1, 0))
+        k = jnp.where(steps.live & (share >= motion.share[:-1]), rows, 0).max()
         arc = jax.tree.map(lambda a: a[k], steps)
         width = arc.share[1] - arc.share[0]
         xi = jnp.clip((share - arc.share[0]) / jnp.where(width > 0, width, 1.0), 0.0, 1.0)

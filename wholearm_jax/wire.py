@@ -141,7 +141,10 @@ def chebyshev(nodes: int) -> np.ndarray:
 
 def _lay(marched, places, start, resolution) -> Pieces:
     """Cut the wire into its pieces, each in the chart that it is charted by."""
-    inside = jnp.isfinite(places.s) & (stop_gradient(places.s) < stop_gradient(places.end_s))
+    # A kink at the end cuts off no piece: in one so short forces vary by rounding alone, and so would the place of the
+    # least and the derivatives there.
+    before_end = stop_gradient(places.s) < stop_gradient(places.end_s) - digits(places.end_s, 5 / 8)
+    inside = jnp.isfinite(places.s) & before_end
     count = inside.sum() + 1
     last = marched.chart[jnp.maximum(marched.n - 1, 0)]
     # Piece k ends at place k, which lies in the chart of the segment before it.
