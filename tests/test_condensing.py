@@ -34,11 +34,11 @@ def _problem(name, count, *, free):
 
 def _dense(linear):
     """Derivatives of all rooms and of what must vanish by all variables but those that stay."""
-    phases, intervals, rooms, _ = linear.rates.room.shape
-    knots, size = intervals + 1, 2 * phases * (intervals + 1)
-    jacobian = np.zeros((phases, intervals, rooms, linear.still.size))
-    for p, k in np.ndindex(phases, intervals):
-        at = 2 * (p * knots + k)
+    phases, parts, rooms, _ = linear.rates.room.shape
+    size = 2 * phases * KNOTS
+    jacobian = np.zeros((phases, parts, rooms, linear.still.size))
+    for p, k in np.ndindex(phases, parts):
+        at = 2 * (p * KNOTS + int(linear.owner[p, k]))
         places = [size + at, size + at + 1, at, at + 1, at + 2, at + 3, 2 * size + p]
         jacobian[p, k][:, places] = linear.rates.room[p, k]
     moves = ~np.asarray(linear.still)
@@ -51,7 +51,7 @@ def _dense(linear):
 def test_a_condensed_step_solves_every_equation(name, count, free):
     linear, rng = _problem(name, count, free=free)
     assert np.all(np.isfinite(linear.at.room)), "the problem must be one that can be simulated"
-    live = np.asarray(linear.at.weight) > 0
+    live = np.asarray(linear.weight) > 0
     stiff, aim = (np.where(live, rng.uniform(low, 1.0, live.shape), 0.0) for low in (0.1, -1.0))
     way, level, prices = stepped(linear, stiff, aim, 1e-3)
     jacobian, across = _dense(linear)

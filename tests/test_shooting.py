@@ -21,8 +21,9 @@ HOW = Integration()
 
 
 def _shot(table, intervals, q):
-    """One interval."""
-    return jax.tree.map(lambda a: a[0], shoot(table, HOW, intervals, q[None]))
+    """One interval: its parts, and its end."""
+    shot = shoot(table, HOW, intervals, q[None])
+    return shot.parts, shot.end[0]
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +43,9 @@ def _moving(table):
 def test_an_interval_crosses_a_reversal_as_the_simulation_does(flip):
     q, reversal = _moving(flip)
     intervals = 300
-    shot = _shot(flip, intervals, q)
-    assert float(shot.end[0]) > reversal, "the interval must cross the reversal"
-    assert (np.asarray(shot.weight) > 0).sum() == 18, "two parts of one step with nine samples"
+    parts, end = _shot(flip, intervals, q)
+    assert float(end[0]) > reversal, "the interval must cross the reversal"
+    assert (np.asarray(parts.weight) > 0).sum() == 18, "two parts of one step with nine samples"
     values = q[2:6].reshape(2, 2) * flip.torque_limit
     duration = jnp.exp(q[6]) / intervals
     seen = window(wa.torque([0.0, float(duration)], values), jnp.zeros(()), duration)
@@ -52,7 +53,7 @@ def test_an_interval_crosses_a_reversal_as_the_simulation_does(flip):
     motion = move(flip, seen, duration, how=Integration(tolerance=1e-13), s=s, speed=flip.length * q[1])
     s_end = (motion.s[motion.count] - flip.breaks[0]) / flip.length
     v_end = motion.w[motion.count] / duration / flip.length
-    np.testing.assert_allclose(shot.end, [s_end, v_end], rtol=1e-9)
+    np.testing.assert_allclose(end, [s_end, v_end], rtol=1e-9)
 
 
 def test_paces_bound_the_speed_between_knots(flip):
@@ -61,7 +62,7 @@ def test_paces_bound_the_speed_between_knots(flip):
     s, v = flip.breaks[0] + 0.3 * flip.length, speed * flip.length
     torque = [squeeze.hold(flip, s, v, a).torque / flip.torque_limit for a in (-brake, brake)]
     q = jnp.concatenate([jnp.array([0.3, speed]), *torque, jnp.zeros(1)])
-    shot = _shot(flip, intervals, q)
+    parts, end = _shot(flip, intervals, q)
     seen = window(wa.torque([0.0, 1 / intervals], q[2:6].reshape(2, 2) * flip.torque_limit), 0.0, 1 / intervals)
     motion = move(flip, seen, jnp.asarray(1 / intervals), how=Integration(tolerance=1e-12), s=s, speed=v, free=True)
     steps = arcs(flip, seen, 1 / intervals, motion)
@@ -69,10 +70,10 @@ def test_paces_bound_the_speed_between_knots(flip):
     each = jax.vmap(lambda k: jax.vmap(lambda xi: on_arc(jax.tree.map(lambda a: a[k], steps), xi)[2])(places))
     speeds = np.asarray(each(np.arange(int(motion.count)))) * intervals / float(flip.length)
     assert speeds[0, 0] == pytest.approx(speed)
-    assert float(shot.end[1]) > 0 > speeds.min()
-    bound = float(shot.pace[shot.pace_weight > 0].min())
+    assert float(end[1]) > 0 > speeds.min()
+    bound = float(parts.pace[parts.pace_weight > 0].min())
     assert speeds.min() - 0.2 * np.ptp(speeds) < bound < speeds.min()
-    np.testing.assert_allclose(shot.pace_weight.sum(), 1 / intervals)
+    np.testing.assert_allclose(parts.pace_weight.sum(), 1 / intervals)
 
 
 def test_derivatives_of_an_interval_that_is_cut(flip):
@@ -80,8 +81,8 @@ def test_derivatives_of_an_interval_that_is_cut(flip):
 
     @jax.jit
     def everything(q):
-        shot = _shot(flip, 300, q)
-        return jnp.concatenate([shot.forces.ravel(), shot.pace, shot.end])
+        parts, end = _shot(flip, 300, q)
+        return jnp.concatenate([parts.forces.ravel(), parts.pace.ravel(), end])
 
     exact = jax.jit(jax.jacfwd(everything))(q)
 

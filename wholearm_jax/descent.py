@@ -32,10 +32,10 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.condensing import following, free, newton_step, of_states, order, together
 from wholearm_jax.forces import smooth_margin
-from wholearm_jax.linearisation import Limits, Linear, change_of_rooms, gather, linearise, sizes
+from wholearm_jax.linearisation import Limits, Linear, change_of_rooms, gather, linearise, rooms_of, sizes
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Table
-from wholearm_jax.shooting import PACES, PARTS, ROWS, Variables, samples_of
+from wholearm_jax.shooting import Variables
 from wholearm_jax.squeeze import acceleration_terms
 from wholearm_jax.stepping import Integration
 
@@ -57,8 +57,8 @@ class Duals(NamedTuple):
     chosen), the temperature and the `coldest` that it may become, the shares of its last step that were taken, and the
     largest price of joining the intervals."""
 
-    slack: Float[Array, "phases intervals rooms"]
-    price: Float[Array, "phases intervals rooms"]
+    slack: Float[Array, "phases parts rooms"]
+    price: Float[Array, "phases parts rooms"]
     level: Float[Array, ""]
     temperature: Float[Array, ""]
     coldest: Float[Array, ""]
@@ -66,24 +66,27 @@ class Duals(NamedTuple):
     joining: Float[Array, ""]
 
 
-def interior_point(phases: int = 1) -> optax.GradientTransformationExtraArgs:
-    """The primal-dual direction as an optax transformation; wants `linear=`, and makes its own gradient from it."""
+def interior_point(phases: int, further: int) -> optax.GradientTransformationExtraArgs:
+    """The primal-dual direction as an optax transformation; wants `linear=`, and makes its own gradient from it.
+
+    `further` is how many parts intervals may have beyond one each (`shooting.further`).
+    """
 
     def init(params):
         knots = (params.shape[0] // phases - 1) // 4
-        shape = (phases, knots - 1, PARTS * (samples_of(knots - 1) * ROWS + PACES) + 8 + 4 + 2)
+        shape = (phases, knots - 1 + further, rooms_of(knots))
         level, hot, cold = (jnp.full((), value) for value in (jnp.nan, HOTTEST, COLDEST))
         return Duals(jnp.ones(shape), jnp.zeros(shape), level, hot, cold, jnp.zeros(2), jnp.zeros(()))
 
     def update(updates, state: Duals, params=None, *, linear: Linear, damping, **_):
         at, bears, hot = linear.at, linear.bears, state.temperature
-        live = at.weight > 0
+        live = linear.weight > 0
         least = jnp.where(live & (bears > 0), at.room, jnp.inf).min()
         level = jnp.where(jnp.isnan(state.level), least - 2 * LEAST, state.level)
         given = jnp.where(live, at.room - bears * level, 1.0)
         fresh = ~(state.price > 0)
         slack = jnp.where(live, jnp.maximum(given, jnp.where(fresh, LEAST, state.slack)), 1.0)
-        target = hot * at.weight / slack
+        target = hot * linear.weight / slack
         price = jnp.where(live, jnp.where(fresh, target, state.price), 0.0)
         stiff = price / slack
         miss = given - slack
@@ -147,10 +150,10 @@ def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) ->
 
     def update(updates, state: Cooling, params=None, *, linear: Linear, **extra):
         at, hot = linear.at, state.temperature
-        _, level = smooth_margin(at.room, at.weight * linear.bears, hot)
+        _, level = smooth_margin(at.room, linear.weight * linear.bears, hot)
         above = at.room - linear.bears * level
         # Outside a limit the loss is infinite: there the pull back to it is that of a small room.
-        pull = gather(linear, hot * at.weight / jnp.maximum(above, hot))
+        pull = gather(linear, hot * linear.weight / jnp.maximum(above, hot))
         goals, follow = order(*sizes(linear)).goals, following(linear)
         last = follow.matrix[goals]
 
@@ -163,7 +166,7 @@ def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) ->
         step = arriving(free(linear, jnp.where(linear.still, 0.0, jnp.asarray(updates))), follow.apart[goals])
         way = together(linear, step, follow.matrix @ step + follow.apart)
         change = change_of_rooms(linear, way)
-        within = (at.weight > 0) & (linear.bears == 0) & (at.room > 0)
+        within = (linear.weight > 0) & (linear.bears == 0) & (at.room > 0)
         reach = _reach(jnp.where(within, at.room, 1.0), jnp.where(within, change, 0.0))
         share = jnp.minimum(reach, _cap(linear, way))
         cooled = jnp.maximum(cooling * hot, state.coldest)
@@ -241,8 +244,8 @@ def merit(linear: Linear, hot, joining) -> Float[Array, ""]:
     Where a room is none, as a start may have it, its logarithm goes on as a tangent.
     """
     at, bears = linear.at, linear.bears
-    margin, _ = smooth_margin(at.room, at.weight * bears, hot)
-    weight = at.weight * (1 - bears)
+    margin, _ = smooth_margin(at.room, linear.weight * bears, hot)
+    weight = linear.weight * (1 - bears)
     room = jnp.where(weight > 0, at.room, 1.0)
     log = jnp.where(room > EDGE, jnp.log(jnp.maximum(room, EDGE)), math.log(EDGE) + (room - EDGE) / EDGE)
     return -margin - hot * (weight * log).sum() + 2 * joining * _apart(linear)
@@ -270,7 +273,7 @@ def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimis
     sound = jnp.all(jnp.isfinite(at.room)) & jnp.all(jnp.isfinite(linear.defect))
     held = jnp.isfinite(d.rise)
     better = jax.lax.cond(held, lambda: merit(linear, d.hot, d.state.joining) <= d.merit + d.rise, lambda: held | True)
-    least = jnp.where((at.weight > 0) & (linear.bears > 0), at.room, jnp.inf).min((1, 2))
+    least = jnp.where((linear.weight > 0) & (linear.bears > 0), at.room, jnp.inf).min((1, 2))
     apart = _apart(linear)
 
     def onward():

@@ -27,7 +27,7 @@ from wholearm_jax.precision import array
 from wholearm_jax.result import stays
 from wholearm_jax.scene import Phase, Scene
 from wholearm_jax.schedule import Torque, evenly, in_turn, padded
-from wholearm_jax.shooting import Variables
+from wholearm_jax.shooting import Variables, further
 from wholearm_jax.squeeze import Bound
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration, with_room
@@ -121,7 +121,8 @@ def optimise_group(scene: Scene, group: Group) -> tuple[list[Torque], str, list[
         return _schedules(group, begins[0]), why, []
     if group.begin is not None and not group.begin.serves:
         return _schedules(group, begins[0]), "no torque lets this formation take over at the limited rate", []
-    problem, method = group.problem(_limits(group)), descent_method(wanted.optimiser, len(group.phases))
+    problem = group.problem(_limits(group))
+    method = descent_method(wanted.optimiser, len(group.phases), further(problem.tables))
     found, history = [], []
     for number, start in enumerate(begins):
         for at, torque in group.pins.items():
@@ -179,9 +180,9 @@ def _limits(group: Group) -> Limits:
 
 
 @functools.cache
-def descent_method(optimiser, phases: int):
+def descent_method(optimiser, phases: int, further: int):
     """One transformation for every use, so that programs are not compiled again."""
-    return interior_point(phases) if optimiser is None else projected(optimiser)
+    return interior_point(phases, further) if optimiser is None else projected(optimiser)
 
 
 stacked_tables = jax.jit(stacked)

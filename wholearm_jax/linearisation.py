@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.forces import spare
 from wholearm_jax.reduction import Table, change, on_panel, powers
-from wholearm_jax.shooting import PARTS, ROWS, Shot, Variables, local, samples_of, shoot
+from wholearm_jax.shooting import PACES, ROWS, Samples, Variables, local, samples_of, shoot
 from wholearm_jax.stepping import Integration
 
 
@@ -37,45 +38,55 @@ OF_PHASES = Limits(rate=False, shortest=True, longest=True, passing=False, pinne
 
 
 class Rooms(NamedTuple):
-    """Of each interval: what must stay positive (forces over the margin, the others over zero), with weights (0: does
-    not exist), and the state in which the interval ends."""
+    """What must stay positive in each part of the intervals (forces over the margin, the others over zero), and the
+    states in which the intervals end."""
 
-    room: Float[Array, "*intervals rooms"]
-    weight: Float[Array, "*intervals rooms"]
-    end: Float[Array, "*intervals 2"]
+    room: Float[Array, "phases parts rooms"]
+    end: Float[Array, "phases intervals 2"]
 
 
 class Linear(NamedTuple):
-    """All intervals at `p` with derivatives: `at` and `rates` (last axis: an interval's seven numbers), what must
-    vanish, `defect`, and its derivatives `across`; `bears` marks the rooms that the margin lowers, `still` the
-    variables that stay."""
+    """All intervals at `p` with derivatives: `at` and `rates` (last axis: an interval's seven numbers); the rooms'
+    `weight` (0: does not exist), the interval that each part is of (`Shot.owner`); what must vanish, `defect`, and its
+    derivatives `across`; `bears` marks the rooms that the margin lowers, `still` the variables that stay."""
 
     at: Rooms
     rates: Rooms
+    weight: Float[Array, "phases parts rooms"]
+    owner: Int[Array, "phases parts"]
     defect: Float[Array, "e"]
     across: Float[Array, "e p"]
     bears: Float[Array, "rooms"]
     still: Bool[Array, "p"]
 
 
-def rooms(q: Float[Array, "phases intervals 7"], tables: Table, limits: Limits, how: Integration) -> Rooms:
-    """All intervals of phases that follow one another at speed, one phase after the other."""
+def rooms(q: Float[Array, "phases intervals 7"], tables: Table, limits: Limits, how: Integration):
+    """All intervals of phases that follow one another at speed, one phase after the other: rooms, and what has no
+    derivatives, `weight` and `owner` of `Linear`."""
     phases, intervals = q.shape[:2]
     slowest = jnp.zeros((phases, intervals)).at[:, 0].set(limits.passing).at[0, 0].set(-jnp.inf)
     own, shared = eqx.partition(limits, OF_PHASES)
 
     def one(phase):
         q, slowest, table, own = phase
-        shots = shoot(table, how, intervals, q)
-        each = jax.vmap(partial(_rooms, intervals), (0, 0, 0, None, None))
-        return each(q, shots, slowest, table, eqx.combine(own, shared))
+        shot = shoot(table, how, intervals, q)
+        first = jnp.arange(shot.owner.size) < intervals
+        least = jnp.where(first, slowest[shot.owner], 0.0)
+        each = jax.vmap(partial(_rooms, intervals), (0, 0, 0, 0, None, None))
+        room, weight = each(q[shot.owner], shot.parts, first, least, table, eqx.combine(own, shared))
+        return Rooms(room, shot.end), (stop_gradient(weight), shot.owner)
 
     return jax.lax.map(one, (q, slowest, tables, own))
 
 
-def _rooms(intervals: int, q: Float[Array, "7"], shot: Shot, slowest, table: Table, limits: Limits) -> Rooms:
-    """One interval; `slowest` is the least speed with which it may begin, and -inf where it starts at rest; `limits`
-    are those of its phase."""
+def rooms_of(knots: int) -> int:
+    """How many rooms `_rooms` has."""
+    return samples_of(knots - 1) * ROWS + 8 + 4 + PACES + 2
+
+
+def _rooms(intervals: int, q: Float[Array, "7"], part: Samples, first, slowest, table: Table, limits: Limits):
+    """One part of an interval, and their weights; what does not depend on the part belongs to the `first`. `slowest` is
+    the least speed with which it may begin, and -inf where it starts at rest; `limits` are those of its phase."""
     torque, log = q[2:6], q[6]
     bounded = jnp.isfinite(limits.rate)
     step = jnp.where(bounded, limits.rate, 1.0) / table.torque_limit * jnp.exp(log) / intervals
@@ -84,15 +95,15 @@ def _rooms(intervals: int, q: Float[Array, "7"], shot: Shot, slowest, table: Tab
     free = span > 0
     ends = jnp.stack([log - jnp.log(limits.shortest), jnp.log(limits.longest) - log]) / jnp.where(free, span, 1.0)
     later = slowest > -jnp.inf
-    pace = shot.pace.at[0].add(-jnp.where(later, slowest, 0.0))
-    room = [(shot.forces / limits.unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, pace, ends]
-    one = jnp.full((), 1 / intervals)
-    sampled = (shot.weight[:, None] * ~spare(table)).ravel()
+    pace = part.pace.at[0].add(-jnp.where(later, slowest, 0.0))
+    room = [(part.forces / limits.unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, pace, ends]
+    one = first / intervals
+    sampled = (part.weight[:, None] * ~spare(table)).ravel()
     climbs = jnp.tile(jnp.where(bounded, one / 4, 0.0), 2)
     # From rest the first coefficient is the speed, zero, and the second the acceleration.
-    paces = shot.pace_weight.at[0].multiply(later).at[1].multiply(later | ~limits.pinned[0])
+    paces = part.pace_weight.at[0].multiply(later).at[1].multiply(later | ~limits.pinned[0])
     weight = [sampled, jnp.full(8, one / 4), climbs, paces, jnp.full(2, jnp.where(free, one / 4, 0.0))]
-    return Rooms(jnp.concatenate(room), jnp.concatenate(weight), shot.end)
+    return jnp.concatenate(room), jnp.concatenate(weight)
 
 
 def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> Linear:
@@ -102,9 +113,10 @@ def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> 
     q = local(p)
 
     def along(way):
-        return jax.jvp(lambda q: rooms(q, tables, limits, how), (q,), (jnp.broadcast_to(way, q.shape),))
+        changes = jnp.broadcast_to(way, q.shape)
+        return jax.jvp(lambda q: rooms(q, tables, limits, how), (q,), (changes,), has_aux=True)
 
-    at, rates = jax.vmap(along, out_axes=(None, -1))(jnp.eye(7))
+    at, rates, (weight, owner) = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(7))
     columns, ends = _columns(phases, knots)
     row = np.arange(ends.size)
     n = 4 * phases * knots + phases
@@ -117,10 +129,12 @@ def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> 
     def seams(x):
         return _seams(unravel(x), tables)
 
-    bears = np.arange(at.room.shape[2]) < PARTS * samples_of(knots - 1) * ROWS
+    bears = np.arange(rooms_of(knots)) < samples_of(knots - 1) * ROWS
     return Linear(
         at,
         rates,
+        weight,
+        owner,
         jnp.concatenate([defect, seams(flat)]),
         jnp.concatenate([across, jax.jacfwd(seams)(flat)]),
         jnp.asarray(bears * 1.0),
@@ -171,7 +185,7 @@ def _still(limits: Limits, phases: int, knots: int) -> Bool[Array, "p"]:
 
 def sizes(linear: Linear) -> tuple[int, int]:
     """Phases and knots."""
-    phases, intervals = linear.at.room.shape[:2]
+    phases, intervals = linear.at.end.shape[:2]
     return phases, intervals + 1
 
 
@@ -185,16 +199,25 @@ def scattered(linear: Linear, values: Float[Array, "phases intervals 7"]) -> Flo
     return jnp.where(linear.still, 0.0, jnp.zeros(linear.still.shape[0]).at[columns(linear)].add(values))
 
 
-def gather(linear: Linear, values: Float[Array, "phases intervals rooms"]) -> Float[Array, "p"]:
+def _by_interval(linear: Linear, values: Float[Array, "phases parts *rest"]) -> Float[Array, "phases intervals *rest"]:
+    """Numbers of each part, summed for its interval."""
+    phases, intervals = linear.at.end.shape[:2]
+    at = np.arange(phases)[:, None], linear.owner[:, intervals:]
+    return values[:, :intervals].at[at].add(values[:, intervals:])
+
+
+def gather(linear: Linear, values: Float[Array, "phases parts rooms"]) -> Float[Array, "p"]:
     """`J^T values`, with `J` the derivatives of all rooms."""
-    return scattered(linear, jnp.einsum("pkr,pkrq->pkq", values, linear.rates.room))
+    return scattered(linear, _by_interval(linear, jnp.einsum("pkr,pkrq->pkq", values, linear.rates.room)))
 
 
-def blocks(linear: Linear, values: Float[Array, "phases intervals rooms"]) -> Float[Array, "phases intervals 7 7"]:
+def blocks(linear: Linear, values: Float[Array, "phases parts rooms"]) -> Float[Array, "phases intervals 7 7"]:
     """`J^T diag(values) J` for each interval's own seven variables."""
-    return jnp.einsum("pkr,pkrq,pkrs->pkqs", values, linear.rates.room, linear.rates.room)
+    rates = linear.rates.room
+    return _by_interval(linear, jnp.einsum("pkr,pkrq,pkrs->pkqs", values, rates, rates))
 
 
-def change_of_rooms(linear: Linear, way: Float[Array, "p"]) -> Float[Array, "phases intervals rooms"]:
+def change_of_rooms(linear: Linear, way: Float[Array, "p"]) -> Float[Array, "phases parts rooms"]:
     """`J way`."""
-    return jnp.einsum("pkrq,pkq->pkr", linear.rates.room, way[columns(linear)])
+    own = jnp.take_along_axis(way[columns(linear)], linear.owner[..., None], axis=1)
+    return jnp.einsum("pkrq,pkq->pkr", linear.rates.room, own)

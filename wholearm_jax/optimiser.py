@@ -34,7 +34,7 @@ from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result, describe
 from wholearm_jax.scene import Scene, replace_duration
 from wholearm_jax.schedule import Torque, evenly, in_turn, rounded
-from wholearm_jax.shooting import Variables
+from wholearm_jax.shooting import Variables, further
 from wholearm_jax.squeeze import Bound, bound
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration, with_room
@@ -234,7 +234,7 @@ def optimise_beside(
     """Compile what `optimise` runs in a thread of its own, while wires are traced; it is to be waited for."""
     sizes = sorted({len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"})
     squeezes = beside(_squeeze_blank, tuple(sizes), knots)
-    descents = [beside(_advance_blank, n, knots, descent_method(optimiser, n)) for n in sizes]
+    descents = [beside(_advance_blank, n, knots, optimiser) for n in sizes]
     return squeezes, *descents, beside(run_blank, _rows(scene, knots), with_room(Integration(), knots))
 
 
@@ -260,9 +260,10 @@ def _squeeze_blank(sizes: tuple[int, ...], knots: int) -> None:
         guesses([table] * phases, np.ones(phases), knots, TORQUE_SHARE)
 
 
-def _advance_blank(phases: int, knots: int, method) -> None:
+def _advance_blank(phases: int, knots: int, optimiser: optax.GradientTransformation | None) -> None:
     """Take one step of a descent on tables that have no wire."""
     tables = stacked_tables([blank(Resolution())] * phases)
+    method = descent_method(optimiser, phases, further(tables))
     each = np.ones(phases)
     plain = (np.full(2, np.inf), each, each, np.zeros(()), np.zeros((phases, knots), bool), each)
     limits = Limits(*(array(a) for a in plain))

@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.forces import MOST_ROLLING, Arcs, arc, linear_slacks, sampled_slacks
 from wholearm_jax.landing import acceleration, single_step
@@ -38,7 +38,7 @@ from wholearm_jax.stepping import Integration
 ONE_STEP = 50  # intervals of a phase from which one solver step in each serves; fewer take two
 ROWS = 4 + MOST_ROLLING  # slacks a sample
 SPACES = 8  # between the places of an interval at which forces are sampled
-PARTS = 3  # pieces of the wire that one interval may touch
+SPARE = 3  # times that a phase's intervals may be cut beyond once in each of its wire's pieces, as by going back
 HALF = 4  # numbers that bound the speed from below in half of an interval
 PACES = 2 * HALF
 LANDINGS = 30  # most Newton steps to the place where an interval is cut
@@ -65,16 +65,29 @@ def samples_of(intervals: int) -> int:
     return SPACES + steps_of(intervals)
 
 
-class Shot(NamedTuple):
-    """Intervals simulated: forces' slacks [N] (`forces.linear_slacks`) at every sample, the sample's share of the phase
-    (0: none), speeds (`_paces`) in wire lengths a duration with their shares, and the state at its end as in
-    `Variables`."""
+def further(table: Table) -> int:
+    """Room for the parts behind the first ones of all intervals of a phase together."""
+    return table.factor.shape[-1] + SPARE
 
-    forces: Float[Array, "*intervals samples rows"]
-    weight: Float[Array, "*intervals samples"]
-    pace: Float[Array, "*intervals paces"]
-    pace_weight: Float[Array, "*intervals paces"]
-    end: Float[Array, "*intervals 2"]
+
+class Samples(NamedTuple):
+    """What was sampled in a part of an interval: forces' slacks [N] (`forces.linear_slacks`), the samples' shares of
+    the phase (0: none), and speeds (`_paces`) in wire lengths a duration with their shares."""
+
+    forces: Float[Array, "*parts samples rows"]
+    weight: Float[Array, "*parts samples"]
+    pace: Float[Array, "*parts paces"]
+    pace_weight: Float[Array, "*parts paces"]
+
+
+class Shot(NamedTuple):
+    """Intervals simulated: all their parts, in which interval each lies (`owner`), and the states at the intervals'
+    ends as in `Variables`. Part `k` is the first one of interval `k`; those behind the intervals' number are further
+    ones."""
+
+    parts: Samples
+    owner: Int[Array, "parts"]
+    end: Float[Array, "intervals 2"]
 
 
 def local(p: Variables) -> Float[Array, "phases intervals 7"]:
@@ -84,50 +97,46 @@ def local(p: Variables) -> Float[Array, "phases intervals 7"]:
 
 
 class _Way(NamedTuple):
-    """An interval on its way: where it has come to, through so many parts, one in each piece of the wire."""
+    """An interval on its way: where it has come to, and whether one part is behind it; each lies in one piece."""
 
     share: Float[Array, "*intervals"]
     y: Float[Array, "*intervals 2"]
     piece: Int[Array, "*intervals"]
-    count: Int[Array, "*intervals"]
-
-
-class _Samples(NamedTuple):
-    """Forces, speeds, and their shares of the phase, as in `Shot`."""
-
-    forces: Float[Array, "samples rows"]
-    weight: Float[Array, "samples"]
-    pace: Float[Array, "paces"]
-    pace_weight: Float[Array, "paces"]
+    begun: Bool[Array, "*intervals"]
 
 
 def shoot(table: Table, how: Integration, intervals: int, q: Float[Array, "cut 7"]) -> Shot:
     """Simulate intervals of a phase, which as a whole has `intervals`.
 
-    An interval that touches more than `PARTS` pieces, or whose cut is not found, ends in NaN.
+    Where together they are cut more often than there is room for (`further`), or a cut is not found, they end in NaN.
     """
-    cut = q.shape[0]
+    cut, room = q.shape[0], q.shape[0] + further(table)
     begin = jax.vmap(lambda q: _set_out(table, intervals, q))(q)
-    first, samples = jax.vmap(partial(_uncut, table, how, intervals))(begin, q)
-    all_parts = jax.tree.map(lambda a: jnp.zeros((cut, PARTS, *a.shape[1:]), a.dtype).at[:, 0].set(a), samples)
+    begun, firsts = jax.vmap(partial(_uncut, table, how, intervals))(begin, q)
+    parts = jax.tree.map(lambda a: jnp.zeros((room, *a.shape[1:]), a.dtype).at[:cut].set(a), firsts)
+    owner = jnp.minimum(jnp.arange(room), cut - 1)
 
-    def waiting(at: _Way):
-        return (at.share < 1) & (at.count < PARTS)
+    def going(state):
+        at, _, _, used = state
+        return jnp.any(at.share < 1) & (used < room)
 
     def next_part(state):
         """Most intervals have one part: the others go one part at a time."""
-        at, all_parts = state
-        k = jnp.argmax(waiting(at))
+        at, parts, owner, used = state
+        k = jnp.argmax(at.share < 1)
         one = jax.tree.map(lambda a: pick(a, k), at)
         after, samples = _one_part(table, how, intervals, one, pick(q, k))
-        at = jax.tree.map(lambda a, new: a.at[k].set(new), at, after)
-        return at, jax.tree.map(lambda a, new: a.at[k, one.count].set(new), all_parts, samples)
+        row = jnp.where(one.begun, used, k)
+        at, parts = (
+            jax.tree.map(lambda a, new, place=place: a.at[place].set(new), old, fresh)
+            for old, fresh, place in ((at, after, k), (parts, samples, row))
+        )
+        return at, parts, owner.at[row].set(k), used + one.begun
 
-    done, all_parts = jax.lax.while_loop(lambda state: jnp.any(waiting(state[0])), next_part, (first, all_parts))
-    joined = jax.tree.map(lambda a: a.reshape(cut, -1, *a.shape[3:]), all_parts)
+    done, parts, owner, _ = jax.lax.while_loop(going, next_part, (begun, parts, owner, jnp.asarray(cut)))
     y = jnp.where((done.share < 1)[:, None], jnp.nan, done.y)
     end = jnp.stack([y[:, 0] - table.breaks[0], y[:, 1] * intervals], axis=1) / table.length
-    return Shot(**joined._asdict(), end=end)
+    return Shot(parts, owner, end)
 
 
 def _set_out(table: Table, intervals: int, q: Float[Array, "7"]) -> _Way:
@@ -135,21 +144,21 @@ def _set_out(table: Table, intervals: int, q: Float[Array, "7"]) -> _Way:
     y = jnp.stack([table.breaks[0] + table.length * q[0], table.length / intervals * q[1]])
     real = jnp.arange(table.breaks.shape[0]) < table.count
     piece = jnp.maximum(((stop_gradient(y[0]) >= table.breaks) & real).sum() - 1, 0)
-    return _Way(jnp.zeros(()), y, piece, jnp.zeros((), int))
+    return _Way(jnp.zeros(()), y, piece, jnp.asarray(False))
 
 
-def _uncut(table: Table, how: Integration, intervals: int, at: _Way, q: Float[Array, "7"]) -> tuple[_Way, _Samples]:
+def _uncut(table: Table, how: Integration, intervals: int, at: _Way, q: Float[Array, "7"]) -> tuple[_Way, Samples]:
     """To the interval's end, within the piece that it begins in; one that comes past that piece's end does not set
     out."""
     seen, duration = _schedule(table, intervals, q)
     when, place = _steps(table, seen, duration, how, at, 1.0, steps_of(intervals))
     past = place[-1, 0] > _goal(table, at.piece)
-    ended = _Way(jnp.ones_like(at.share), place[-1], at.piece, at.count + 1)
+    ended = _Way(jnp.ones_like(at.share), place[-1], at.piece, jnp.asarray(True))
     after = jax.tree.map(lambda stay, go: jnp.where(past, stay, go), at, ended)
     return after, _sampled(table, seen, duration, intervals, when, place, at.piece)
 
 
-def _one_part(table: Table, how: Integration, intervals: int, at: _Way, q: Float[Array, "7"]) -> tuple[_Way, _Samples]:
+def _one_part(table: Table, how: Integration, intervals: int, at: _Way, q: Float[Array, "7"]) -> tuple[_Way, Samples]:
     """To the interval's end, or the end of the piece."""
     seen, duration = _schedule(table, intervals, q)
     when, place, onward = _to_break(table, seen, duration, how, at, steps_of(intervals))
@@ -158,7 +167,7 @@ def _one_part(table: Table, how: Integration, intervals: int, at: _Way, q: Float
         share=jnp.where(onward, when[-1], 1.0),
         y=place[-1] * jnp.where(onward, jnp.stack([jnp.ones_like(factor), factor]), 1.0),
         piece=at.piece + onward,
-        count=at.count + 1,
+        begun=jnp.asarray(True),
     )
     return after, _sampled(table, seen, duration, intervals, when, place, at.piece)
 
@@ -174,7 +183,7 @@ def _goal(table: Table, piece) -> Float[Array, ""]:
     return jnp.where(piece >= table.count - 1, jnp.inf, table.breaks[piece + 1])
 
 
-def _sampled(table: Table, seen: Window, duration, intervals: int, when, place, piece) -> _Samples:
+def _sampled(table: Table, seen: Window, duration, intervals: int, when, place, piece) -> Samples:
     """Forces and speeds of a part."""
     count, samples = steps_of(intervals), samples_of(intervals)
     steps = _arcs(table, seen, duration, when, place, piece)
@@ -182,7 +191,7 @@ def _sampled(table: Table, seen: Window, duration, intervals: int, when, place, 
     span = stop_gradient(when[-1] - when[0]) / intervals
     weight, pace_weight = (jnp.full(each, span / each) for each in (samples, PACES))
     forces = jnp.where(span > 0, forces, 0.0)
-    return _Samples(forces, weight, _paces(steps) / (table.length / intervals), pace_weight)
+    return Samples(forces, weight, _paces(steps) / (table.length / intervals), pace_weight)
 
 
 def _arcs(table: Table, seen: Window, duration, when, place, piece) -> Arcs:
