@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from wholearm_jax.condensing import following, free, newton_step, of_states, order, together
 from wholearm_jax.forces import smooth_margin
@@ -53,12 +53,13 @@ JOINED = 1e-9  # sum of the defects below which the intervals count as joined
 
 
 class Duals(NamedTuple):
-    """The interior point's own unknowns: slack and price of every room, the level `m` of the margin (NaN: not yet
-    chosen), the temperature and the `coldest` that it may become, the shares of its last step that were taken, and the
-    largest price of joining the intervals."""
+    """The interior point's own unknowns: slack and price of every room, with the intervals that their parts were of
+    (`owner`), the level `m` of the margin (NaN: not yet chosen), the temperature and the `coldest` that it may become,
+    the shares of its last step that were taken, and the largest price of joining the intervals."""
 
     slack: Float[Array, "phases parts rooms"]
     price: Float[Array, "phases parts rooms"]
+    owner: Int[Array, "phases parts"]
     level: Float[Array, ""]
     temperature: Float[Array, ""]
     coldest: Float[Array, ""]
@@ -76,7 +77,8 @@ def interior_point(phases: int, further: int) -> optax.GradientTransformationExt
         knots = (params.shape[0] // phases - 1) // 4
         shape = (phases, knots - 1 + further, rooms_of(knots))
         level, hot, cold = (jnp.full((), value) for value in (jnp.nan, HOTTEST, COLDEST))
-        return Duals(jnp.ones(shape), jnp.zeros(shape), level, hot, cold, jnp.zeros(2), jnp.zeros(()))
+        owner = jnp.zeros(shape[:2], int)
+        return Duals(jnp.ones(shape), jnp.zeros(shape), owner, level, hot, cold, jnp.zeros(2), jnp.zeros(()))
 
     def update(updates, state: Duals, params=None, *, linear: Linear, damping, **_):
         at, bears, hot = linear.at, linear.bears, state.temperature
@@ -84,7 +86,8 @@ def interior_point(phases: int, further: int) -> optax.GradientTransformationExt
         least = jnp.where(live & (bears > 0), at.room, jnp.inf).min()
         level = jnp.where(jnp.isnan(state.level), least - 2 * LEAST, state.level)
         given = jnp.where(live, at.room - bears * level, 1.0)
-        fresh = ~(state.price > 0)
+        moved_on = state.owner != linear.owner  # what is known of a part is of no use to another interval's
+        fresh = ~(state.price > 0) | moved_on[..., None]
         slack = jnp.where(live, jnp.maximum(given, jnp.where(fresh, LEAST, state.slack)), 1.0)
         target = hot * linear.weight / slack
         price = jnp.where(live, jnp.where(fresh, target, state.price), 0.0)
@@ -104,6 +107,7 @@ def interior_point(phases: int, further: int) -> optax.GradientTransformationExt
         state = Duals(
             slack + primal * dslack,
             price + dual * dprice,
+            linear.owner,
             level + primal * rise,
             jnp.clip(hot * cooling, coldest, HOTTEST),
             coldest,

@@ -82,8 +82,8 @@ class Samples(NamedTuple):
 
 class Shot(NamedTuple):
     """Intervals simulated: all their parts, in which interval each lies (`owner`), and the states at the intervals'
-    ends as in `Variables`. Part `k` is the first one of interval `k`; those behind the intervals' number are further
-    ones."""
+    ends as in `Variables`. Part `k` is the first one of interval `k`; behind the intervals' number is one for each
+    piece of the wire that an interval comes into, and then those that come into a piece once more."""
 
     parts: Samples
     owner: Int[Array, "parts"]
@@ -111,29 +111,33 @@ def shoot(table: Table, how: Integration, intervals: int, q: Float[Array, "cut 7
     Where together they are cut more often than there is room for (`further`), or a cut is not found, they end in NaN.
     """
     cut, room = q.shape[0], q.shape[0] + further(table)
+    pieces = table.factor.shape[-1]
     begin = jax.vmap(lambda q: _set_out(table, intervals, q))(q)
     begun, firsts = jax.vmap(partial(_uncut, table, how, intervals))(begin, q)
     parts = jax.tree.map(lambda a: jnp.zeros((room, *a.shape[1:]), a.dtype).at[:cut].set(a), firsts)
     owner = jnp.minimum(jnp.arange(room), cut - 1)
 
     def going(state):
-        at, _, _, used = state
-        return jnp.any(at.share < 1) & (used < room)
+        at, *_, spare = state
+        return jnp.any(at.share < 1) & (spare < room)
 
     def next_part(state):
         """Most intervals have one part: the others go one part at a time."""
-        at, parts, owner, used = state
+        at, parts, owner, come, spare = state
         k = jnp.argmax(at.share < 1)
         one = jax.tree.map(lambda a: pick(a, k), at)
         after, samples = _one_part(table, how, intervals, one, pick(q, k))
-        row = jnp.where(one.begun, used, k)
+        again = pick(come, one.piece)
+        row = jnp.where(one.begun, jnp.where(again, spare, cut + one.piece), k)
         at, parts = (
             jax.tree.map(lambda a, new, place=place: a.at[place].set(new), old, fresh)
             for old, fresh, place in ((at, after, k), (parts, samples, row))
         )
-        return at, parts, owner.at[row].set(k), used + one.begun
+        come = come.at[one.piece].set(again | one.begun)
+        return at, parts, owner.at[row].set(k), come, spare + (one.begun & again)
 
-    done, parts, owner, _ = jax.lax.while_loop(going, next_part, (begun, parts, owner, jnp.asarray(cut)))
+    start = begun, parts, owner, jnp.zeros(pieces, bool), jnp.asarray(cut + pieces)
+    done, parts, owner, *_ = jax.lax.while_loop(going, next_part, start)
     y = jnp.where((done.share < 1)[:, None], jnp.nan, done.y)
     end = jnp.stack([y[:, 0] - table.breaks[0], y[:, 1] * intervals], axis=1) / table.length
     return Shot(parts, owner, end)
