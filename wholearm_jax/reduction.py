@@ -121,14 +121,15 @@ def reduce_wire(system: System, wire: Wire) -> Table:
     torque, newtons = system.torque_unit, system.force_unit
     per_term = jnp.stack([jnp.ones_like(torque), jnp.ones_like(torque), jnp.ones_like(torque), 1 / torque, 1 / torque])
     unit = configuration_unit(system.length)
-    columns = {
-        "acceleration": ahead * per_term,
-        "backward": behind * per_term[jnp.array([0, 3, 4])],
-        "force": force * per_term * newtons,
-        "configuration": wire.nodes * unit,
-        "velocity": x * unit,
-    }
-    fitted, error = _fitted(columns)
+    # Apart from what friction and mass change, so that scenes that differ in these alone share their wires.
+    places, by_places = _fitted({"configuration": wire.nodes * unit, "velocity": x * unit})
+    dynamics, by_dynamics = _fitted(
+        {
+            "acceleration": ahead * per_term,
+            "backward": behind * per_term[jnp.array([0, 3, 4])],
+            "force": force * per_term * newtons,
+        }
+    )
     worst = condition.max()
     eps = jnp.finfo(x.dtype).eps
     broken = (worst > 0.01 / eps) | ~(upright.min() > 0)
@@ -138,13 +139,14 @@ def reduce_wire(system: System, wire: Wire) -> Table:
         factor=wire.factor,
         first=wire.first,
         panels=wire.panels,
-        **fitted,
+        **places,
+        **dynamics,
         tension=-system.contacts.friction * wire.slip_sign,
         tangential=system.contacts.tangential,
         grip=jnp.where(system.contacts.tangential, system.contacts.friction, 0.0),
         entry=entry[-1] * jnp.append(1.0, jnp.full(4, newtons))[:, None] / unit,
         torque_limit=system.torque_limit,
-        error=error,
+        error=jnp.maximum(by_places, by_dynamics),
         condition=worst,
         status=jnp.where(wire.status > 0, wire.status, jnp.where(broken, int(Status.SINGULAR), 0)),
     )
