@@ -30,7 +30,7 @@ ORDER = (
     ),
     *("march", "start", "places", "wire", "reduction"),
     *("schedule", "stepping", "landing", "motion", "forces", "verdict", "holding"),
-    *("phase", "result", "sampling", "plan", "gradient", "gradient_check"),
+    *("phase", "result", "resting", "sampling", "plan", "gradient", "gradient_check"),
     *("squeeze", "shooting", "linearisation", "condensing", "descent", "pacing"),
     *("formations", "guesses", "handover", "group", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),

@@ -2,6 +2,7 @@
 
 import inspect
 import sys
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -12,9 +13,10 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax import batch_command, command
 from wholearm_jax import survey as survey_module
-from wholearm_jax.batch import QUICK, Checked, check_chunks, check_scene, from_result
+from wholearm_jax.batch import ALONE, GOOD, QUICK, Checked, check_chunks, check_scene, from_result
 from wholearm_jax.outline import first_flaw
-from wholearm_jax.polygon_file import read_polygons
+from wholearm_jax.plan import traced_together
+from wholearm_jax.polygon_file import how_many, read_polygons
 from wholearm_jax.scene_file import SceneError, to_dict
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.status import Status
@@ -107,10 +109,10 @@ def test_what_follows_a_failure_must_be_known_as_well(scene, schedule):
         return check_scene(scene, torque, ARRIVAL, QUICK._replace(error=limit))
 
     for limit, enough in ((np.sqrt(errors[0] * errors[1]), False), (2 * errors[1], True)):
-        answer, good = checked(limit)
+        answer, grade = checked(limit)
         assert int(answer.status) != Status.OK
         assert int(answer.phase) == 0
-        assert bool(good) is enough
+        assert (int(grade) == GOOD) is enough
 
 
 def test_a_draw_depends_on_its_number_alone(scene, ensemble):
@@ -318,6 +320,7 @@ def test_a_store_goes_on_and_ends_the_same(tmp_path, ensemble, schedule):
         ([], "--count"),
         (["--count", "4", "--vary", "colour=1"], "colour"),
         (["--polygons", "absent.npz"], "absent.npz"),
+        (["--count", "4", "--vary", "mass=1%", "--out", "mine.json"], "mine.json"),
         (["--count", "4", "--vary", "mass=1%", "--processes", "2"], "--coordinator"),
     ],
 )
@@ -369,3 +372,72 @@ def test_files_of_polygons_that_are_none(tmp_path, scene, content, said):
         np.savez(path, **content)
     with pytest.raises(SceneError, match=said):
         read_polygons(path, scene)
+
+
+@pytest.mark.parametrize("given", [None, [0.1, 0.2, 0.3], [[0.1, 0.2, 0.3]] * 3])
+def test_friction_of_polygons_is_by_polygon_and_link(tmp_path, scene, given):
+    """The scene's own is by link, also where there are as many polygons as links."""
+    by_link = eqx.tree_at(lambda s: s.object.friction, scene, jnp.array([0.1, 0.2, 0.3]))
+    np.savez(tmp_path / "objects.npz", vertices=np.stack([SEVEN] * 3), **({} if given is None else {"friction": given}))
+    friction = read_polygons(tmp_path / "objects.npz", by_link).scenes.object.friction
+    row = np.array([0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(friction, np.repeat(row[:, None], 3, 1) if np.ndim(given) == 1 else [row] * 3)
+
+
+def test_how_many_polygons_there_are(tmp_path):
+    np.savez(tmp_path / "objects.npz", vertices=np.stack([SEVEN] * 3))
+    assert how_many(tmp_path / "objects.npz") == 3
+    (tmp_path / "other.npz").write_text("none")
+    assert how_many(tmp_path / "other.npz") == how_many(tmp_path / "absent.npz") == 0
+
+
+def test_one_scene_is_not_many(scene, schedule):
+    with pytest.raises(ValueError, match="one scene"):
+        wa.check(scene, schedule)
+
+
+def test_mass_and_inertia_vary_in_any_order(scene):
+    heavy = eqx.tree_at(lambda s: s.object.inertia, scene, jnp.asarray(2e-4), is_leaf=lambda leaf: leaf is None)
+    amounts = {"mass": "20%", "inertia": "10%"}
+    one, other = (
+        vary(heavy, dict(order), seed=SEED).draw(4).object for order in (amounts.items(), [*amounts.items()][::-1])
+    )
+    assert float(one.inertia) == float(other.inertia)
+    alone = vary(heavy, {"inertia": "10%"}, seed=SEED).draw(4).object
+    assert float(one.inertia) == pytest.approx(float(alone.inertia * one.mass / scene.object.mass), rel=1e-12)
+
+
+def waiting(push, first):
+    """The quasi-static schedule after a fifth of a second with other torques."""
+    half = len(push.values) // 2
+    values = [first, first, push.values[0], push.values[half - 1], push.values[half], push.values[-1]]
+    return wa.torque([0.0, 0.2, 0.2, 1.0, 1.0, 2.0], values)
+
+
+@pytest.mark.parametrize(("share", "apart", "held"), [(0.2, 0.0, True), (0.0, 0.05, False)])
+def test_an_object_waits_only_where_some_forces_hold_it(scene, schedule, share, apart, held):
+    """Fingers that open gently do not move the object as far as accelerations tell, but nothing holds it either."""
+    torque = waiting(schedule, share * schedule.values[0] + apart * np.array([-1.0, 1.2]))
+    alone = wa.simulate(scene, torque, arrival=ARRIVAL)
+    assert alone.phases[0].holds[0].start == 0.0, "it waits"
+    assert (alone.phases[0].holds[0].lost is None) is held
+    step = QUICK._replace(how=replace(QUICK.how, steps=True))
+    _, grade = jax.jit(lambda: check_scene(scene, padded(torque), ARRIVAL, step))()
+    assert int(grade) == (GOOD if held else ALONE)
+    assert_as_alone(wa.check([scene], torque, arrival=ARRIVAL, tolerance=1e-10), scene, torque, 0)
+
+
+def test_scenes_that_share_their_geometry_share_their_wires(scene):
+    """All phases are traced once, whatever friction and mass: else `vmap` could not give one of them for all."""
+
+    def wires(friction, mass):
+        where = (lambda s: s.object.friction), (lambda s: s.object.mass)
+        changed = scene
+        for at, value in zip(where, (friction, mass), strict=True):
+            changed = eqx.tree_at(at, changed, value)
+        table = traced_together(changed, QUICK.resolution).table
+        return table.breaks, table.configuration, table.velocity
+
+    frictions, masses = jnp.full((2, 3), 0.1) * jnp.array([[1.0], [1.5]]), jnp.array([0.2, 0.3])
+    breaks, *_ = jax.eval_shape(jax.vmap(wires, out_axes=None), frictions, masses)
+    assert breaks.shape == (len(scene.phases), QUICK.resolution.pieces + 1)

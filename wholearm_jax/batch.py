@@ -36,6 +36,7 @@ from wholearm_jax.plan import (
 from wholearm_jax.programs import Program, beside, wait
 from wholearm_jax.reduction import Table, blank
 from wholearm_jax.requirements import require_positive, require_x64
+from wholearm_jax.resting import surely_held
 from wholearm_jax.result import Result
 from wholearm_jax.scene import Formation, Scene
 from wholearm_jax.schedule import Torque, padded
@@ -47,6 +48,7 @@ from wholearm_jax.wire import Resolution
 BLOCK = 128  # scenes that one device takes at once
 CHUNK = 4096  # scenes whose results are kept together
 ARRIVAL = 0.01  # share of the wire: plans that vary cannot end where the one must that torques were made for
+GOOD, FINER, ALONE = range(3)  # what becomes of a scene at a level
 EXACT = 1e-9  # tolerances below this begin at the full resolution
 
 
@@ -137,6 +139,7 @@ class _Stop(NamedTuple):
     contact: Int[Array, ""]
     end: Float[Array, "5"]
     good: Bool[Array, ""]
+    held: Bool[Array, ""]
 
 
 def check(
@@ -156,9 +159,11 @@ def check(
     it ends within a share `arrival` of its wire's length of the end (1e-6 for a plan that does not vary, by
     `simulate`), at a speed that fits (`verdict.BRAKING`). Memory is that of `chunk` scenes beside the result. Returns
     `Checked`: status, margin, time, contact, phase and end pose of each scene. Never raises for a scene that fails:
-    that is a status. Raises ValueError for a schedule shorter than a plan, for numbers that are not positive, and for a
-    `count` of more scenes than are given.
+    that is a status. Raises ValueError for one scene that is not stacked, for a schedule shorter than a plan, for
+    numbers that are not positive, and for a `count` of more scenes than are given.
     """
+    if isinstance(scenes, Scene) and np.ndim(scenes.object.mass) == 0:
+        raise ValueError("this is one scene: check [scene], or vary it (wholearm_jax.variation.vary)")
     source = scenes if isinstance(scenes, Ensemble) else Given(scenes if isinstance(scenes, Scene) else stack(scenes))
     if count is None:
         if isinstance(source, Ensemble):
@@ -194,24 +199,25 @@ def check_chunks(
 
 
 def _check_rows(source, rows, torque: Torque, arrival, levels, mesh) -> Checked:
-    """Check some scenes, level by level; those of the last that are not good, alone."""
+    """Check some scenes, level by level; alone those of the last that are not good, and of any that want `ALONE`."""
     schedule, steps = padded(torque), steps_within(source.nominal, torque)
-    found, left = None, np.arange(len(rows))
+    found, left, alone = None, np.arange(len(rows)), []
     for level in levels:
         level = level._replace(how=replace(level.how, steps=steps))
-        answer, good = _check_packed(source, rows[left], schedule, arrival, level, mesh)
+        answer, grade = _check_packed(source, rows[left], schedule, arrival, level, mesh)
         if found is None:
             found = answer
         else:
             for column, new in zip(found, answer, strict=True):
                 column[left] = new
-        left = left[~good]
+        alone.append(left[grade == ALONE])
+        left = left[grade == FINER]
         if not len(left):
             break
     assert found is not None
-    for row in left:
-        alone = _check_alone(source.draw(rows[row]), torque, arrival)
-        for column, new in zip(found, alone, strict=True):
+    for row in np.concatenate([*alone, left]):
+        answer = _check_alone(source.draw(rows[row]), torque, arrival)
+        for column, new in zip(found, answer, strict=True):
             column[row] = new
     return found
 
@@ -230,11 +236,12 @@ def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):
 
 
 def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Level, mesh: Mesh):
-    """Check `BLOCK` scenes a device."""
-    side_by_side = source.same_wires or mesh.devices.flat[0].platform != "cpu"
+    """Check `BLOCK` scenes a device: on a processor one after the other, but scenes that share their wires are traced
+    together, once."""
+    side_by_side = mesh.devices.flat[0].platform != "cpu"
     told = source, schedule, arrival, level, side_by_side
     compiled = beside(_check_blank, mesh, told, numbers)
-    tables = _on(mesh, _tables_of, (source, level, side_by_side), numbers)
+    tables = _on(mesh, _tables_of, (source, level, side_by_side or source.same_wires), numbers)
     wait(compiled)
     return _on(mesh, _checks_of, told, numbers, tables)
 
@@ -290,20 +297,22 @@ def _checks_of(told, numbers, tables):
     return jax.vmap(one)(scenes) if side_by_side else jax.lax.map(one, scenes)
 
 
-def check_scene(scene: Scene, schedule: Torque, arrival, level: Level) -> tuple[Checked, Bool[Array, ""]]:
-    """Check one scene (under any transformation), and say whether this level's result is good enough."""
+def check_scene(scene: Scene, schedule: Torque, arrival, level: Level) -> tuple[Checked, Int[Array, ""]]:
+    """Check one scene (under any transformation), and say whether this level's result is `GOOD`, or wants a `FINER` one
+    or `simulate` for this scene `ALONE`."""
     return check_tables(scene, traced_together(scene, level.resolution).table, schedule, arrival, level)
 
 
 def check_tables(
     scene: Scene, tables: Table, schedule: Torque, arrival, level: Level
-) -> tuple[Checked, Bool[Array, ""]]:
+) -> tuple[Checked, Int[Array, ""]]:
     """Check one scene on the tables of its wires."""
 
     def one(clock, phase):
         table, motion, formation = phase
         clock, done = simulate_next(schedule, level.how, arrival, clock, (table, *motion))
-        return clock, _stop(table, done, formation, level)
+        held = surely_held(scene, formation, table, schedule, done)
+        return clock, _stop(table, done, formation, level, held)
 
     told = stacked([(simulate_told(p), p.formation) for p in scene.phases])
     _, stops = jax.lax.scan(one, simulate_first(schedule), (tables, *told))
@@ -321,11 +330,14 @@ def check_tables(
         phase=where,
         end=stops.end[last],
     )
-    return answer, jnp.all(stops.good | ~needed)
+    # Where only a linear programme can tell whether friction holds a rest, `simulate` asks it.
+    doubtful = jnp.any(~stops.held & (jnp.arange(len(scene.phases)) <= last))
+    return answer, jnp.select([jnp.any(~stops.good & needed), doubtful], [FINER, ALONE], GOOD)
 
 
-def _stop(table: Table, done: Outcome, formation: Formation, level: Level) -> _Stop:
-    """One phase's result, and whether it is to be trusted: a fine table, and neither steps nor pieces used up."""
+def _stop(table: Table, done: Outcome, formation: Formation, level: Level, held) -> _Stop:
+    """One phase's result, and whether it is to be trusted: a fine table, and neither steps nor pieces used up; rests
+    that are `held` for sure."""
     motion = done.motion
     known = jnp.isfinite(done.score.margin) & (table.status == 0)
     of_slot = jnp.cumsum(~formation.tangential) - 1
@@ -341,6 +353,7 @@ def _stop(table: Table, done: Outcome, formation: Formation, level: Level) -> _S
         contact=jnp.where(contact >= 0, of_slot[contact], -1),
         end=jnp.where(table.status == 0, final_configuration(table, motion), jnp.nan),
         good=jnp.where(table.status == 0, fine & worth, worth),
+        held=held | (table.status != 0),
     )
 
 

@@ -75,6 +75,7 @@ def optimise_robustly(
 
     `rate` is the step of Adam as a share of the torque limits. `nominal` starts from another schedule than
     `optimise(ensemble.scene)` finds. `callback` sees each step's number and how its schedule does on the samples.
+    Whether friction can hold the object where it waits is not asked of every sample, as `simulate` does of one scene.
     Raises ValueError for a plan that holds its object in a phase, for numbers that are not positive, and for a
     `nominal` schedule that is shorter than the plan or beyond the torque limits.
     """

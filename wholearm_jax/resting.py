@@ -1,0 +1,66 @@
+r"""Rest: a proof that friction can hold an object that stands still, without a linear programme.
+
+Of an object that friction keeps at rest the forces are not determined (`holding`). But two sets of them are known,
+those of setting out forward and backward: accelerations `a+ <= 0 <= a-` and forces `c+`, `c-`, linear in the torque.
+The mean of both in which the accelerations cancel balances, and its friction is within every cone if that of `c+` and
+`c-` is. Where it is not, the rest may still be possible: that is for the linear programme to say.
+
+Derivation: section 4 of `docs/derivation.md`.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from wholearm_jax.elimination import inverse, times
+from wholearm_jax.forces import slack
+from wholearm_jax.lookup import pick
+from wholearm_jax.motion import Motion
+from wholearm_jax.phase import Outcome
+from wholearm_jax.reduction import Table, balance, on_panel, powers
+from wholearm_jax.result import BRIEF
+from wholearm_jax.scene import Formation, Scene, body
+from wholearm_jax.schedule import Torque, Window, interval, torque_in, window
+from wholearm_jax.system import System, system
+
+
+def surely_held(scene: Scene, formation: Formation, table: Table, schedule: Torque, done: Outcome) -> Bool[Array, ""]:
+    """Whether every time that friction holds the object at rest in a phase is proved to be possible."""
+    motion = done.motion
+    rows = jnp.arange(motion.held.shape[0])
+    rests = motion.held & (rows < motion.count) & (jnp.diff(motion.share) > BRIEF)
+
+    def all_proved():
+        mechanics = system(body(scene.object), scene.hand, scene.gravity, formation)
+        seen = window(schedule, done.start, done.duration)
+
+        def next_rest(at):
+            left, _ = at
+            k = jnp.argmax(left)
+            return left.at[k].set(False), _proved(mechanics, table, seen, motion, k)
+
+        return jax.lax.while_loop(lambda at: at[1] & at[0].any(), next_rest, (rests, jnp.asarray(True)))[1]
+
+    return jax.lax.cond(rests.any(), all_proved, lambda: jnp.asarray(True))
+
+
+def _proved(mechanics: System, table: Table, seen: Window, motion: Motion, k) -> Bool[Array, ""]:
+    """Whether one rest, step `k` of a motion, is."""
+    piece, begin, end = pick(motion.piece, k), pick(motion.share, k), pick(motion.share, k + 1)
+    panel, xi = powers(table, piece, pick(motion.s, k))
+    z, x = (
+        on_panel(values, panel, xi) / mechanics.configuration_unit for values in (table.configuration, table.velocity)
+    )
+    friction = mechanics.contacts.friction
+    sliding = -pick(table.tension, piece) / jnp.where(friction > 0, friction, 1.0)  # signs of slip, as traced
+    ends = jnp.stack([torque_in(seen, interval(seen, at), at) for at in (begin, end)])
+    inside = (seen.share > begin) & (seen.share < end)
+    corners = jnp.concatenate([ends, jnp.where(inside[:, None], seen.values, ends[0])]) / mechanics.torque_unit
+    terms = jnp.concatenate([jnp.ones_like(corners[:, :1]), corners], axis=1)
+
+    def within(sign):
+        matrix, right = balance(mechanics, z, x, jnp.zeros_like(x), sign * sliding, sign * jnp.sign(x[3:]))
+        solved = times(inverse(matrix)[0], right[:, jnp.array([0, 3, 4])])[1:]
+        return jax.vmap(lambda one: slack(table, times(solved, one)))(terms).min() >= 0
+
+    return jax.lax.map(within, jnp.array([1.0, -1.0])).all()
