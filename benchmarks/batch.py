@@ -200,7 +200,7 @@ def rollouts(ensemble, torque) -> dict:
         begins, step = clock(ensemble.scene, wanted)
         models = [free_bodies(s, step, CONVEX).model for s in scenes]
         begun = time.perf_counter()
-        roll_out(models, np.stack(starts), motor_torques(torque, begins))
+        roll_out(models, np.stack(starts), motor_torques(torque, begins, step))
         rate = ROLLOUTS / (time.perf_counter() - begun)
         pose = max(done.position_error / way, abs(done.angle_error) / turn)
         rows.append({"timestep": step, "rate": rate, "pose_error": float(pose), "margin_error": margin_error(done)})
@@ -225,7 +225,7 @@ def by_coulomb(ensemble, torque) -> dict:
     wanted, error = steps[longest], errors[longest]
     begins, step = clock(ensemble.scene, wanted)
     copies = [(free_bodies(s, step), start) for s, start in zip(scenes, starts, strict=True)]
-    torques, workers = motor_torques(torque, begins), os.cpu_count() or 1
+    torques, workers = motor_torques(torque, begins, step), os.cpu_count() or 1
     driven(copies[:workers], torques[:10], workers)  # starts the processes
     begun = time.perf_counter()
     driven(copies, torques, workers)

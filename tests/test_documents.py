@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import wholearm_jax as wa
+from wholearm_jax import scene_file
 from wholearm_jax.status import Status
 
 ROOT = Path(__file__).parents[1]
@@ -32,6 +33,14 @@ def test_examples_in_docstrings_run(name, tmp_path):
 def test_every_status_has_a_row_that_agrees():
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", (ROOT / "docs" / "statuses.md").read_text(), re.MULTILINE))
     assert rows == {status.label: status.advice for status in Status}
+
+
+def test_the_page_on_scene_files_has_every_key():
+    rows = re.findall(r"^\| ((?:`[\w.]+`(?:, )?)+) \|", (ROOT / "docs" / "scenes.md").read_text(), re.MULTILINE)
+    told = [key for row in rows for key in re.findall(r"`([\w.]+)`", row)]
+    models = scene_file._Scene, scene_file._Finger, scene_file._Object, scene_file._Phase
+    known = [name for model in models for name in model.model_fields if name != "hand"]
+    assert sorted(told) == sorted([*known, *(f"hand.{name}" for name in scene_file._Hand.model_fields)])
 
 
 def test_sections_that_the_code_cites_exist():

@@ -19,11 +19,22 @@ from scipy.stats import binomtest
 import wholearm_jax as wa
 from wholearm_jax import execution
 from wholearm_jax.contacts import contacts, frames, normal_rows
-from wholearm_jax.execution import Ending, Tolerance, clock, drive, execute, judge, start_of, stepper, target_of
+from wholearm_jax.execution import (
+    Ending,
+    Tolerance,
+    clock,
+    drive,
+    execute,
+    judge,
+    motor_torques,
+    start_of,
+    stepper,
+    target_of,
+)
 from wholearm_jax.execution_drawing import animate, draw_execution, draw_execution_strip
 from wholearm_jax.free_bodies import CONVEX, Softness, _wedges, free_bodies
-from wholearm_jax.perturbation import Amounts, _perturbed, perturb, start_near, wilson
-from wholearm_jax.result_file import write_execution
+from wholearm_jax.perturbation import Amounts, _perturbed, _summary, perturb, start_near, wilson
+from wholearm_jax.result_file import _perturbed_row, write_execution
 from wholearm_jax.scene import body, formation, parse_contact
 from wholearm_jax.system import system
 
@@ -250,6 +261,13 @@ def test_a_plan_predicted_to_fail_fails(predictions):
     assert execute(weak, timestep=5e-4).ending is not Ending.OK
 
 
+def test_a_plan_of_one_step():
+    schedule = wa.torque([0.0, 1.0], [[0.0, 1.0], [2.0, 3.0]])
+    begins, step = clock(wa.load("heptagon"), 5.0)
+    assert (len(begins), step) == (1, 2.0)
+    np.testing.assert_allclose(motor_torques(schedule, begins, step), [[2.0, 3.0]])
+
+
 # --- perturbed executions --------------------------------------------------------------------------------------------
 
 
@@ -278,6 +296,16 @@ def test_small_changes_of_mass_do_no_harm(predictions):
     many = perturb(predictions["heptagon"], 6, Amounts(mass=0.02), tolerance=Tolerance(1e-3, 0.02))
     assert many.successes == 6
     assert many.interval == pytest.approx((0.6097, 1.0), abs=1e-4)
+
+
+def test_a_copy_without_friction_can_be_told():
+    """Of a coefficient of 0 any share is 0."""
+    scene = eqx.tree_at(lambda s: s.object.friction, wa.load("heptagon"), jnp.array([0.0, 0.1, 0.2]))
+    changed = _perturbed(scene, Amounts(friction=0.1), np.random.default_rng(0))
+    told = _summary(scene, changed, np.zeros(5), np.zeros(5), Ending.OK)
+    assert told.friction[0] == 1.0
+    np.testing.assert_allclose(told.friction[1:], np.asarray(changed.object.friction[1:]) / [0.1, 0.2])
+    json.dumps(_perturbed_row(told), allow_nan=False)
 
 
 def test_a_perturbed_start_touches(predictions):

@@ -6,7 +6,7 @@ import equinox as eqx
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.gradient_check import Slope, check_gradient
+from wholearm_jax.gradient_check import Slope, _steadiest, check_gradient
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +47,9 @@ def test_a_plan_without_a_margin_has_no_slopes(slide):
     scene, even = slide
     with pytest.raises(ValueError, match="no margin"):
         check_gradient(scene, wa.Torque(even.times, 0 * even.values))
+
+
+def test_a_step_without_a_margin_tells_nothing():
+    assert _steadiest([math.nan, 1.0, 1.1, 1.1001]) == (pytest.approx(1e-4), 1.1001)
+    change, best = _steadiest([math.nan, 1.0, math.inf])
+    assert Slope("hand", 1e-8, 1.0, 1.0, best, change).finding == "unsure"

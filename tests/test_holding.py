@@ -310,3 +310,17 @@ def test_motion_that_stops_holds_and_starts_again():
     ).phases
     assert stuck.status is wa.Status.STUCK
     assert stuck.message.startswith(f"slide left: stuck, t = 1 s, at rest since {rests[0].start:.6g} s: ")
+
+
+def test_a_rest_between_rounded_times_has_its_own_torque():
+    """Times of phases are sums, those of a schedule are rounded: a step at either end belongs to the neighbour."""
+    balance, squeeze, none = of_block(), [0.06, -0.06], [-5.0, 5.0]
+    before, after = 0.1 + 0.2, 0.1 + 0.7
+    assert before > 0.3
+    assert after < 0.8
+    until = wa.torque([0.0, 0.3, 0.3, 1.0], [squeeze, squeeze, none, none])
+    since = wa.torque([0.0, 0.8, 0.8, 1.0], [none, none, squeeze, squeeze])
+    for schedule, start, end in ((until, 0.1, before), (since, after, 1.0)):
+        held = watch(balance, schedule, start, end)
+        assert held.lost is None
+        assert held.margin == pytest.approx(balance.support(squeeze).margin, rel=1e-9)

@@ -116,6 +116,8 @@ def test_durations_are_free_within_their_range():
     assert 0.5 <= float(free.scene.phases[0].duration) <= 2.0
     assert float(free.scene.phases[0].duration) != pytest.approx(1.0, abs=1e-3)
     assert free.result.margin >= 0.999 * fixed.result.margin
+    shortest = eqx.tree_at(lambda s: s.phases[0].duration, scene, jnp.asarray(0.5))
+    assert float(free.bounds[0].value) == float(wa.bounds(shortest)[0].value), "no duration allows more"
 
 
 def test_any_optax_optimiser_descends():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from wholearm_jax.plan import simulate
-from wholearm_jax.report import read_result, render, report
+from wholearm_jax.report import _worst, read_result, render, report
 from wholearm_jax.result_file import summary, write_summary, write_torque, write_trajectory
 from wholearm_jax.scene_file import SceneError, load, parse, to_dict
 from wholearm_jax.schedule import torque
@@ -294,3 +294,12 @@ def contrast(one, other) -> float:
 
     low, high = sorted((luminance(one), luminance(other)))
     return (high + 0.05) / (low + 0.05)
+
+
+def test_the_margin_is_that_of_a_phase_that_moves():
+    """As a plan's is: not that of a hold, and none where a phase has none."""
+    moves, holds = {"name": "slide", "margin": 0.8}, {"name": "hold", "margin": 0.1}
+    plan = {"phase": [{"name": "slide"}, {"name": "hold", "hold": True}]}
+    assert _worst({"phases": [moves, holds], "scene": plan}) is moves
+    assert _worst({"phases": [moves | {"margin": None}, holds], "scene": plan}) is None
+    assert _worst({"phases": [holds], "scene": {"phase": plan["phase"][1:]}}) is holds

@@ -60,3 +60,19 @@ def test_phases_that_pass_on_at_speed_are_sampled_until_they_do():
         assert after.time[0] == pytest.approx(before.time[-1])
         np.testing.assert_allclose(after.z[0], before.z[-1], atol=1e-8)
         np.testing.assert_allclose(phase.outcome.leaving, before.z_dot[-1], rtol=1e-8, atol=1e-10)
+
+
+def test_torques_are_those_of_the_schedule_while_the_object_waits():
+    """A wait is one step of the motion, however many knots the schedule has meanwhile."""
+    scene = wa.load("heptagon")
+    push = wa.quasistatic(scene)
+    weak = np.asarray(push.values)[:1] * np.array([0.1, 0.3, 0.05, 0.2])[:, None]
+    times = np.concatenate([[0.0, 0.1, 0.2, 0.3, 0.3], [1.0, 1.0, 2.0]])
+    values = np.concatenate([weak, [push.values[0]] * 2, [push.values[-1]] * 2])
+    result = wa.simulate(scene, wa.torque(times, values))
+    assert result.phases[0].holds, "it must wait"
+    course, *_ = wa.trajectory(result, SAMPLES)
+    inside = np.abs(np.subtract.outer(course.time, [0.3, 1.0])).min(1) > 1e-9  # between the steps
+    for joint in range(2):
+        expected = np.interp(course.time, times, values[:, joint])
+        np.testing.assert_allclose(course.torque[inside, joint], expected[inside], atol=1e-12)

@@ -4,12 +4,13 @@ import copy
 import tomllib
 from importlib import resources
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
 import tomli_w
 
-from wholearm_jax.scene import body
+from wholearm_jax.scene import body, heading
 from wholearm_jax.scene_file import SceneError, bundled, load, parse, save, to_dict
 
 NAN, INF = float("nan"), float("inf")
@@ -349,3 +350,10 @@ def test_binary_file(tmp_path):
 def test_parse_names_its_source():
     with pytest.raises(SceneError, match=r"^my scene: object\.mass: must be greater than 0, not -1$"):
         parse(changed("object", "mass", -1), "my scene")
+
+
+def test_a_phase_without_a_heading_is_not_written():
+    scene = load("heptagon")
+    scene = eqx.tree_at(lambda s: s.phases[0].heading, scene, heading(None))
+    with pytest.raises(ValueError, match="'slide left' does not say which way"):
+        to_dict(scene)

@@ -13,7 +13,8 @@ import jax
 import typer
 
 SceneName = Annotated[str, typer.Argument(help="A bundled scene's name, or the path of a scene file.")]
-TorqueFile = Annotated[Path, typer.Option("--torque", help="Torque schedule, CSV with the header t,tau1,tau2.")]
+TORQUE = "Torque schedule, CSV with the header t,tau1,tau2."
+TorqueFile = Annotated[Path, typer.Option("--torque", help=TORQUE)]
 
 
 class BadInput(Exception):

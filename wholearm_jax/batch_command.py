@@ -15,9 +15,10 @@ from typing import Annotated, Any
 
 import typer
 
-from wholearm_jax.arguments import BadInput, SceneName, TorqueFile, note_limits, writing
+from wholearm_jax.arguments import TORQUE, BadInput, SceneName, note, note_limits, writing
 from wholearm_jax.settings import configure
 
+BESIDE = (".json", ".png", ".svg", ".pdf")  # what stands beside a store, under its name
 MANY = 100_000  # scenes from which on compiling well, which takes 1.6 times as long, pays (`benchmarks/batch.py`)
 ARRIVAL = 0.01  # share of the wire: perturbed plans cannot end where an unperturbed one must
 Vary = Annotated[list[str] | None, typer.Option("--vary", help="QUANTITY=AMOUNT, e.g. vertices=0.0005, friction=20%.")]
@@ -25,16 +26,21 @@ Vary = Annotated[list[str] | None, typer.Option("--vary", help="QUANTITY=AMOUNT,
 
 def check(
     scene: SceneName,
-    torque: TorqueFile,
     out: Annotated[Path, typer.Option(help="The Zarr store of results; a summary and figures stand beside it.")],
+    torque: Annotated[Path | None, typer.Option(help=f"{TORQUE} Needed unless --optimise is given.")] = None,
     vary: Vary = None,
     polygons: Annotated[Path | None, typer.Option(help="Objects to put in the scene, .npz.")] = None,
     count: Annotated[int | None, typer.Option(min=1, help="How many scenes to draw.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
     arrival: Annotated[
-        float, typer.Option(min=1e-9, max=1.0, help="Arrived: this near the wire's end, as a share of its length.")
+        float,
+        typer.Option(
+            min=1e-9, max=1.0, help="Arrived: this near the wire's end, as a share of its length; 1e-6 for --optimise."
+        ),
     ] = ARRIVAL,
-    tolerance: Annotated[float, typer.Option(min=1e-12, max=1e-3, help="Error of the margin [N].")] = 1e-6,
+    tolerance: Annotated[
+        float, typer.Option(min=1e-12, max=1e-3, help="Of margins [N]; below 1e-9, all is computed as by `simulate`.")
+    ] = 1e-6,
     chunk: Annotated[int, typer.Option(min=1, help="Scenes that are kept together.")] = 4096,
     optimise: Annotated[bool, typer.Option("--optimise", help="Optimise the schedule of each scene.")] = False,
     knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase, with --optimise.")] = 51,
@@ -45,33 +51,36 @@ def check(
     """Check a schedule against many variants of a scene; the same command goes on with a store it left unfinished."""
     if (polygons is None) == (count is None) or (polygons is None) != bool(vary):
         raise BadInput("check: give either --count, with --vary QUANTITY=AMOUNT, or --polygons FILE.npz")
-    configure(compiled="quickly" if count is not None and count < MANY else "well")
+    if torque is None and not optimise:
+        raise BadInput("check: give --torque FILE, or --optimise")
+    if out.suffix in BESIDE:
+        raise BadInput(f"--out {out}: {out.suffix} is what stands beside the store; name the store otherwise, as .zarr")
+    from wholearm_jax.polygon_file import how_many, read_polygons
+
+    many = how_many(polygons) if polygons else count or 0
+    configure(compiled="quickly" if many < MANY else "well")
     _use_all_processors()
     place = _join(coordinator, processes, process)
     try:
         import zarr  # noqa: F401
     except ModuleNotFoundError:
         raise BadInput("checking many scenes needs Zarr: pip install 'wholearm_jax[batch]'") from None
-    from wholearm_jax.plan import require_covered, require_motion
-    from wholearm_jax.polygon_file import read_polygons
-    from wholearm_jax.result_file import read_torque
+    from wholearm_jax.plan import require_motion
     from wholearm_jax.scene_file import load
     from wholearm_jax.store import StoreError, fingerprint, identity
 
-    loaded, schedule = load(scene), read_torque(torque)
+    loaded = load(scene)
     try:
         require_motion(loaded)
     except ValueError as error:
         raise BadInput(f"{scene}: {error}") from None
-    if process in (None, 0) and not optimise:
-        note_limits(loaded, schedule, torque)
+    schedule = None if optimise or torque is None else _followed(loaded, torque, place)
+    if optimise and torque is not None and place.first:
+        note(f"with --optimise each scene gets a schedule of its own: {torque} is not followed")
     source = read_polygons(polygons, loaded) if polygons else ensemble(loaded, vary, seed)
     total = count if count is not None else int(source.scenes.object.mass.shape[0])  # pyright: ignore
-    try:
-        require_covered(loaded, schedule)
-    except ValueError as error:
-        raise BadInput(f"{torque}: {error}") from None
-    settings = {"arrival": arrival, "tolerance": tolerance, "optimise": knots if optimise else None, "seed": seed}
+    judged = {"arrival": None, "tolerance": None} if optimise else {"arrival": arrival, "tolerance": tolerance}
+    settings = judged | {"optimise": knots if optimise else None, "seed": seed}
     settings |= {"scenes": fingerprint(source), "torque": fingerprint(schedule)}
     job = _Job(source, schedule, settings, total, min(chunk, total), optimise, knots)
     try:
@@ -122,6 +131,21 @@ class _Job:
         """Rows of the schedule that each scene has for itself; 0 where all follow the given one."""
         scene = self.source.draw(0)
         return self.knots * len(scene.phases) if self.optimise else 0
+
+
+def _followed(scene, torque: Path, place: _Place):
+    """The schedule that all scenes follow."""
+    from wholearm_jax.plan import require_covered
+    from wholearm_jax.result_file import read_torque
+
+    schedule = read_torque(torque)
+    try:
+        require_covered(scene, schedule)
+    except ValueError as error:
+        raise BadInput(f"{torque}: {error}") from None
+    if place.first:
+        note_limits(scene, schedule, torque)
+    return schedule
 
 
 def ensemble(scene, amounts: list[str] | None, seed: int):

@@ -143,7 +143,7 @@ def execute(
     require_wires(prediction)
     times, step = clock(scene, timestep)
     bodies = free_bodies(scene, step, softness)
-    course, creep = drive(bodies, scene, start_of(prediction), motor_torques(prediction.torque, times), step)
+    course, creep = drive(bodies, scene, start_of(prediction), motor_torques(prediction.torque, times, step), step)
     expected, target = _expected(prediction, bodies.names), target_of(prediction)
     ending, lost = judge(scene, course.z[-1], target, tolerance, creep)
     return Execution(
@@ -176,10 +176,10 @@ def clock(scene: Scene, timestep: float) -> tuple[Float[np.ndarray, "steps"], fl
     return np.arange(count) * (total / count), total / count
 
 
-def motor_torques(schedule: Torque, begins: Float[np.ndarray, "steps"]) -> Float[np.ndarray, "steps 2"]:
-    """The torque [N m] that each step holds: that at its middle."""
+def motor_torques(schedule: Torque, begins: Float[np.ndarray, "steps"], step: float) -> Float[np.ndarray, "steps 2"]:
+    """The torque [N m] that each step of length `step` [s] holds: that at its middle."""
     times, values = np.asarray(schedule.times), np.asarray(schedule.values)
-    middle = begins + (begins[1] - begins[0]) / 2
+    middle = begins + step / 2
     return np.stack([np.interp(middle, times, values[:, k]) for k in range(2)], axis=1)
 
 

@@ -91,10 +91,11 @@ def _share(option: str, text: str) -> float:
 
 def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> None:
     """Write an execution's files."""
-    from wholearm_jax.result_file import execution_summary, write_execution, write_summary
+    from wholearm_jax.result_file import discard_execution, execution_summary, write_execution, write_summary
     from wholearm_jax.writing import write_whole
 
     with writing(f"--out {folder}"):
+        discard_execution(folder)
         write_summary(execution_summary(done, many, torque=str(torque)), folder / "execution.json")
         write_execution(done, folder / "execution.csv")
         write_whole(folder / "model.xml", done.model_xml)

@@ -82,7 +82,7 @@ def check_gradient(
                 return float(value(optax.tree.add_scale(floats, h, way), at, "none"))
 
             ladder = [_richardson(along, step) for step in STEPS]
-            change, best = min((abs(fine - rough), fine) for rough, fine in itertools.pairwise(ladder))
+            change, best = _steadiest(ladder)
             found.append(Slope(name, tolerance, float(forward), reverse, best, change))
     return tuple(found)
 
@@ -100,6 +100,13 @@ def _directions(floats, seed: int):
         "start": lambda inputs: inputs[0].start,
     }
     return {name: eqx.tree_at(where, still, where(whole)) for name, where in groups.items()}
+
+
+def _steadiest(ladder: list[float]) -> tuple[float, float]:
+    """The least change from one step of a ladder to the next, and where that leads; where a step leads to no margin it
+    tells nothing."""
+    pairs = [(abs(fine - rough), fine) for rough, fine in itertools.pairwise(ladder)]
+    return min((pair for pair in pairs if np.isfinite(pair[0])), default=(np.inf, np.nan))
 
 
 def _richardson(function, largest: float) -> float:

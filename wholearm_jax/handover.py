@@ -93,9 +93,13 @@ def handovers(
     `lead` of the phase in which it then sets out, whose duration is at most that of `durations`.
     """
 
-    def moving(k):
+    def lasts(k):
         length = float(scene.phases[k].duration)
-        return Moving(traced[k].table, float(np.clip(length, *(durations or (length, length)))), float(tops[k].value))
+        moves = scene.phases[k].arrive != "hold"
+        return float(np.clip(length, *durations)) if durations is not None and moves else length
+
+    def moving(k):
+        return Moving(traced[k].table, lasts(k), float(tops[k].value))
 
     def resting(k):
         return Resting(*balance_at_start(scene, scene.phases[k], traced[k]), float(tops[k].value))
@@ -103,7 +107,7 @@ def handovers(
     def near(group, begin):
         if begin is None or not begin.serves:
             return None
-        time = sum(float(scene.phases[k].duration) for k in group) - begin.lead
+        time = sum(lasts(k) for k in group) - begin.lead
         return Near(begin.begin, rate_limit * time)
 
     def between(group, following, begin):

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.contacts import normal_rows, slip_rows
 from wholearm_jax.scene import Formation, Scene, body
-from wholearm_jax.schedule import Torque
+from wholearm_jax.schedule import Torque, rounding
 from wholearm_jax.system import system
 
 POSSIBLE = -1e-8  # least margin that counts as possible, over the unit of force: rounding
@@ -201,17 +201,20 @@ def watch(balance: Statics, schedule: Torque, start: float, end: float) -> Held:
 
 
 def _corners(schedule: Torque, start: float, end: float):
-    """Times and torques between which a schedule is linear from `start` to `end`; a step has both its sides."""
+    """Times and torques between which a schedule is linear from `start` to `end`; a step has both its sides, but for
+    one at `start` or `end`, where only what is between counts."""
     times, values = np.asarray(schedule.times), np.asarray(schedule.values)
-    inside = (times > start) & (times < end)
+    near = rounding(times, start, end)
+    inside = (times > start + near) & (times < end - near)
 
-    def at(time, side):
-        row = int(np.clip(np.searchsorted(times, time, side=side) - 1, 0, len(times) - 2))
+    def at(time, row):
+        row = int(np.clip(row, 0, len(times) - 2))
         gap = times[row + 1] - times[row]
         return values[row] + (values[row + 1] - values[row]) * ((time - times[row]) / gap if gap > 0 else 1.0)
 
-    corners = [start, *times[inside].tolist(), end]
-    return corners, [at(start, "right"), *values[inside], at(end, "left")]
+    first = np.searchsorted(times, start + near, side="right") - 1
+    last = np.searchsorted(times, end - near, side="left") - 1
+    return [start, *times[inside].tolist(), end], [at(start, first), *values[inside], at(end, last)]
 
 
 def _still(departure: Departure | None) -> Float[np.ndarray, "rows 3"]:

@@ -20,7 +20,7 @@ import numpy as np
 import optax
 
 from wholearm_jax.descent import advance, begin
-from wholearm_jax.group import TORQUE_SHARE, Group, Wanted, descent_method, optimise_group, stacked_tables
+from wholearm_jax.group import SHORTEST, TORQUE_SHARE, Group, Wanted, descent_method, optimise_group, stacked_tables
 from wholearm_jax.guesses import guesses
 from wholearm_jax.handover import Handover, handovers, steady
 from wholearm_jax.linearisation import Limits
@@ -161,7 +161,9 @@ def optimise(
     traced = traced or trace(scene)
     if any(int(at.table.status) == Status.OK for at in traced):
         wait(*compiled)
-    tops = bounds(scene, traced=traced)
+    # A bound covers speeds as multiples of a length a duration: of the shortest that a phase may choose.
+    least = scene if durations is None else _lasting(scene, max(durations[0], SHORTEST * durations[1]))
+    tops = bounds(least, traced=traced)
     rows = _rows(scene, knots)
     told = callback and _in_turn_called(callback)
     wanted = Wanted(knots, rows, steps, rate_limit, durations, passing, optimiser, tolerance, told)

@@ -112,7 +112,7 @@ def perturb(
     scenes = [_perturbed(prediction.scene, amounts, rng) for _ in range(count)]
     shifts = rng.uniform(-1, 1, (count, 3)) * amounts.start
     begins, step = clock(prediction.scene, timestep)
-    torques = motor_torques(prediction.torque, begins)
+    torques = motor_torques(prediction.torque, begins, step)
     nominal, target = start_of(prediction), target_of(prediction)
 
     def copies():
@@ -185,8 +185,9 @@ def _end(bodies: FreeBodies, start, torques) -> tuple[Float[np.ndarray, "5"], fl
 
 def _summary(scene: Scene, changed: Scene, end, target, ending: Ending) -> Perturbed:
     off = end - target
+    was, now = (np.asarray(one.object.friction) for one in (scene, changed))
     return Perturbed(
-        friction=np.asarray(changed.object.friction / scene.object.friction),
+        friction=np.where(was > 0, now / np.where(was > 0, was, 1.0), 1.0),
         mass=float(changed.object.mass / scene.object.mass),
         end=end,
         position_error=float(np.hypot(*off[:2])),

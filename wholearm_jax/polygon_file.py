@@ -17,6 +17,17 @@ from wholearm_jax.outline import first_flaw
 from wholearm_jax.scene import Polygon, Scene
 from wholearm_jax.scene_file import SceneError
 
+_UNREADABLE = (OSError, ValueError, KeyError, AttributeError, TypeError, EOFError, BadZipFile, ZlibError)
+
+
+def how_many(path: Path) -> int:
+    """How many polygons a file has; 0 where it is none, of which `read_polygons` tells more."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return len(file["vertices"])
+    except _UNREADABLE:
+        return 0
+
 
 def read_polygons(path: Path, scene: Scene) -> Given:
     """The scene with each polygon of a file. Raises `SceneError` naming the file, the entry and what is wrong."""
@@ -25,7 +36,7 @@ def read_polygons(path: Path, scene: Scene) -> Given:
             held = {name: np.asarray(file[name]) for name in file.files}
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file") from None
-    except (OSError, ValueError, AttributeError, TypeError, EOFError, BadZipFile, ZlibError) as error:
+    except _UNREADABLE as error:
         raise SceneError(f"{path}: not a NumPy .npz file: {error}") from None
     for name, values in held.items():
         if values.dtype.kind not in "fiu":
@@ -41,9 +52,9 @@ def read_polygons(path: Path, scene: Scene) -> Given:
     rows = np.minimum(np.arange(width + (-width % 8)), count[:, None] - 1)  # rows that pad repeat the last vertex
     vertices = np.take_along_axis(np.asarray(given, float), rows[:, :, None], axis=1)
     mass = _positive(path, "mass", held, (many,), np.asarray(scene.object.mass), strictly=True)
-    friction = held.get("friction", np.asarray(scene.object.friction))
-    friction = friction[:, None] if friction.shape == (many,) else friction
-    friction = _positive(path, "friction", held | {"friction": friction}, (many, 3), friction, strictly=False)
+    rubs = held.get("friction", np.asarray(scene.object.friction)[None])
+    rubs = rubs[:, None] if rubs.ndim == 1 else rubs
+    friction = _positive(path, "friction", {"friction": rubs}, (many, 3), None, strictly=False)
     _named_vertices(path, scene, count)
     shape = Polygon(vertices=vertices, count=count, mass=mass, friction=friction)  # pyright: ignore
     alike = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (many, *np.shape(leaf))), scene)

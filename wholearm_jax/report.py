@@ -109,7 +109,7 @@ def render(written: Written) -> str:
     return pages.get_template("report.html").render(
         summary=summary,
         advice=Status[summary["status"].upper()].advice,
-        worst=_worst(summary["phases"]),
+        worst=_worst(summary),
         rows=[row | {"reached": _reached(row)} for row in summary["phases"]],
         settings=_settings(summary),
         scene_toml=tomli_w.dumps(summary["scene"]),
@@ -152,7 +152,7 @@ def _drawn(written: Written) -> dict[str, Any]:
         )
     shown = {name: _rounded(np.asarray(getattr(hand, name))) for name in ("joint", "length", "offset", "torque_limit")}
     vertices = _rounded(np.asarray(solid.vertices)[: int(solid.count)])
-    worst = _worst(written.summary["phases"])
+    worst = _worst(written.summary)
     return {
         "hand": shown,
         "vertices": vertices,
@@ -231,10 +231,11 @@ def _read_trajectory(path: Path, names: list[str]) -> dict[str, np.ndarray]:
     return {name: np.array(values) for name, values in courses.items()}
 
 
-def _worst(rows) -> dict[str, Any] | None:
-    """The phase whose margin is the plan's."""
-    known = [row for row in rows if row["margin"] is not None]
-    return min(known, key=lambda row: row["margin"]) if known else None
+def _worst(summary: dict[str, Any]) -> dict[str, Any] | None:
+    """The phase whose margin is the plan's (as `Result.hardest`); None where one has no margin."""
+    pairs = zip(summary["phases"], summary["scene"]["phase"], strict=True)
+    rows = [row for row, phase in pairs if not phase.get("hold")] or summary["phases"]
+    return None if any(row["margin"] is None for row in rows) else min(rows, key=lambda row: row["margin"])
 
 
 def _reached(row) -> str:

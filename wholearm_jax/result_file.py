@@ -176,6 +176,13 @@ def discard(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
+def discard_execution(folder: Path) -> None:
+    """The same for what an earlier execution left."""
+    figures = (f"{name}.{kind}" for name in ("execution", "frames") for kind in ("png", "svg", "pdf"))
+    for name in ("execution.json", "execution.csv", "execution.gif", "model.xml", *figures):
+        (folder / name).unlink(missing_ok=True)
+
+
 def write_summary(content: dict[str, Any], path: str | Path) -> None:
     """Write a summary as JSON."""
     write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")

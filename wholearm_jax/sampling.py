@@ -13,7 +13,7 @@ from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Table, on_panel, powers
 from wholearm_jax.requirements import require_positive
 from wholearm_jax.result import Result
-from wholearm_jax.schedule import Torque, padded, rounded, window
+from wholearm_jax.schedule import Torque, interval, padded, rounded, torque_in, window
 from wholearm_jax.status import Status
 
 SAMPLED = 1024  # samples of a phase that one call computes: numbers of samples that differ share a program
@@ -61,7 +61,7 @@ def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shar
         panel, at = powers(table, arc.piece, s)
         forces = force(table, seen, duration, arc.piece, arc.row, share, s, w)
         cn, ct = by_contact(table, arc.piece, jnp.where(arc.held | over, jnp.nan, forces))
-        tau = seen.values[arc.row] + seen.slope[arc.row] * (share - seen.share[arc.row])
+        tau = torque_in(seen, interval(seen, share), share)  # a wait is one step over many intervals
         z_dot = on_panel(table.velocity, panel, at) * w / duration
         return s, on_panel(table.configuration, panel, at), z_dot, tau, cn, ct
 

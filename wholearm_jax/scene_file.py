@@ -317,6 +317,8 @@ def _phase_dict(phase: Phase) -> dict[str, Any]:
     row: dict[str, Any] = {"name": phase.name, "contacts": list(phase.formation.names)}
     if phase.arrive == "hold":
         return row | {"hold": True, "duration": float(phase.duration)}
+    if int(way.coordinate) < 0:
+        raise ValueError(f"phase '{phase.name}' does not say which way it heads: give it a heading such as 'x-'")
     row |= {
         "toward": COORDINATES[int(way.coordinate)] + ("+" if float(way.sign) > 0 else "-"),
         "duration": float(phase.duration),

@@ -87,8 +87,13 @@ def has_steps(schedule: Torque, start: float, end: float) -> bool:
     them but for rounding does not count, as in `window`."""
     times = np.asarray(schedule.times)
     stepped = times[1:][np.diff(times) == 0]
-    near = ROUNDING * np.finfo(times.dtype).eps * (abs(start) + abs(end - start))
+    near = rounding(times, start, end)
     return bool(np.any((stepped > start + near) & (stepped < end - near)))
+
+
+def rounding(times: np.ndarray, start: float, end: float) -> float:
+    """How far beside each other two times of a phase from `start` to `end` count as one, as in `window`."""
+    return ROUNDING * np.finfo(times.dtype).eps * (abs(start) + abs(end - start))
 
 
 def rounded(rows: int, multiple: int = ROWS) -> int:

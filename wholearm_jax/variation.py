@@ -102,7 +102,7 @@ class Ensemble(eqx.Module):
         scene, at = self.scene, 0
         for quantity, amount in self.amounts:
             where = QUANTITIES[quantity].where
-            value = where(self.scene)
+            value = where(scene)  # an inertia that the mass has scaled
             part, at = amount.size * shifts[at : at + value.size].reshape(value.shape), at + value.size
             changed = value * (1 + part) if amount.relative else value + part
             if quantity == "vertices":  # rows that pad repeat the last vertex
@@ -121,7 +121,8 @@ def vary(scene: Scene, amounts: dict[str, float | str], *, seed: int = 0) -> Ens
     Raises ValueError for a quantity that the scene does not have, an amount that is not one, or one by which what is
     drawn may be no scene: a mass that is not positive, a polygon that crosses itself.
     """
-    return Ensemble(scene, tuple((name, _amount(scene, name, given)) for name, given in amounts.items()), seed)
+    checked = {name: _amount(scene, name, given) for name, given in amounts.items()}
+    return Ensemble(scene, tuple((name, checked[name]) for name in QUANTITIES if name in checked), seed)
 
 
 def stack(scenes: Sequence[Scene]) -> Scene:

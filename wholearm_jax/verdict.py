@@ -54,7 +54,7 @@ def judge(
     ended = motion.status
     there = (ended == Status.LEFT_FORMATION) | (ended == Status.OK)
     held = (ended == Status.STUCK) | ((ended == Status.REVERSED) & late)
-    arrived = near & jnp.where(at_rest, slow & (there | held), there)
+    arrived = near & (there | held) & (slow | ~at_rest)
     finish = jnp.where(arrived, int(Status.OK), jnp.where(ended == Status.OK, int(Status.NOT_REACHED), ended))
     stayed = motion.held[0] & (motion.share[1] >= 1)
     departs = jnp.where(motion.held[0], motion.share[1], 0.0)
