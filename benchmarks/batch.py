@@ -221,7 +221,8 @@ def by_coulomb(ensemble, torque) -> dict:
     prediction, scenes, starts = laid_in(ensemble, torque)
     steps = [step for step in STEPS if step >= FINEST]
     errors = [margin_error(execute(prediction, timestep=step)) for step in steps]
-    longest = max((k for k, error in enumerate(errors) if error > 0.01), default=-1) + 1
+    wrong = max((k for k, error in enumerate(errors) if error > 0.01), default=-1)
+    longest = min(wrong + 1, len(steps) - 1)
     wanted, error = steps[longest], errors[longest]
     begins, step = clock(ensemble.scene, wanted)
     copies = [(free_bodies(s, step), start) for s, start in zip(scenes, starts, strict=True)]

@@ -6,8 +6,8 @@ Each run is a process of its own, as a user starts it: `first` is when it prints
 figures are written, too. With an empty cache folder everything is compiled; the second run finds the first one's
 programs there. `apart` splits one more process of each kind by what JAX itself reports:
 importing, tracing Python into programs and lowering them (threads overlap, so that parts may sum to more than the
-whole), compiling, reading kept programs, and the rest (figures, files, the computation). `plain` compiles as XLA does
-by default, without the command line's choice of emitters.
+whole), compiling, reading kept programs, and the rest (figures, files, the computation). `plain` leaves the choice of
+emitters to XLA, and is otherwise compiled as by the command line.
 """
 
 import argparse

@@ -171,7 +171,7 @@ def main() -> None:
     """Measure, save, draw, print."""
     wa.configure()
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="one phase, fewer knots and tolerances")
+    parser.add_argument("--quick", action="store_true", help="one phase, fewer knots and tolerances; saves nothing")
     quick = parser.parse_args().quick
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are to be fresh
     scene = wa.load("heptagon")
@@ -182,9 +182,9 @@ def main() -> None:
             "costs": costs(table, phase, KNOTS[::2] if quick else KNOTS, 3 if quick else 7),
             "accuracy": accuracy(table, phase, TOLERANCES[::3] if quick else TOLERANCES, 3 if quick else 7),
         }
-    path = measure.save("gradients", found)
-    draw(found, path.with_suffix(".svg"))
     tabulate(found)
+    if not quick:
+        draw(found, measure.save("gradients", found).with_suffix(".svg"))
 
 
 if __name__ == "__main__":

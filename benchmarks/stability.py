@@ -39,7 +39,7 @@ def main():
     single = collected(range(max(1, blocks // 10)), options, single=True)
     from stability_report import report
 
-    report(double, single, options.seed, time.perf_counter() - begun)
+    report(double, single, options.seed, time.perf_counter() - begun, keep=not options.quick)
     return None
 
 
@@ -48,7 +48,7 @@ def parsed():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--quick", action="store_true", help="4,000 scenes")
+    parser.add_argument("--quick", action="store_true", help="4,000 scenes; saves nothing")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--part", type=int, nargs="*", help=argparse.SUPPRESS)
     parser.add_argument("--single", action="store_true", help=argparse.SUPPRESS)

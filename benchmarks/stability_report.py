@@ -83,8 +83,8 @@ def compared(double, single) -> dict:
     }
 
 
-def report(double, single, seed, seconds):
-    """Write everything and print the table."""
+def report(double, single, seed, seconds, *, keep):
+    """Print the table, and write everything if it is to be kept."""
     result = {
         "seed": seed,
         "seconds": round(seconds),
@@ -93,10 +93,11 @@ def report(double, single, seed, seconds):
         "limits": {"float64": DOUBLE._asdict(), "float32": SINGLE._asdict()},
         "quantiles": QUANTILES,
     }
-    path = save("stability", result)
-    draw(double, single).savefig(RESULTS / "stability.svg")
     table(result)
-    print(f"{path} after {seconds:.0f} s")
+    print(f"{seconds:.0f} s")
+    if keep:
+        save("stability", result)
+        draw(double, single).savefig(RESULTS / "stability.svg")
 
 
 def table(result):

@@ -419,7 +419,7 @@ def _in_process(*arguments: str, flags: str = "") -> dict:
 def main() -> None:
     """Measure, save, draw, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer solvers and tolerances")
+    parser.add_argument("--quick", action="store_true", help="fewer solvers and tolerances; saves nothing")
     parser.add_argument("--print", choices=("all", "times"), help="measure here and print rows as JSON")
     given = parser.parse_args()
     if given.print:
@@ -437,8 +437,8 @@ def main() -> None:
     within = ratios(found, "package, within a program")
     runs = {"configured": found, "XLA's own choices": plain}
     kept = {"levels": LEVELS, "flags": PLAIN, "ratios": tables, "within a program": within, "runs": runs}
-    path = measure.save("work_precision", kept)
-    draw(found, plain, path.with_suffix(".svg"))
+    if not given.quick:
+        draw(found, plain, measure.save("work_precision", kept).with_suffix(".svg"))
     for name, table in tables.items():
         print(f"\n{name.upper()}")
         tabulate(table, "package")

@@ -407,17 +407,18 @@ def test_mass_and_inertia_vary_in_any_order(scene):
     assert float(one.inertia) == pytest.approx(float(alone.inertia * one.mass / scene.object.mass), rel=1e-12)
 
 
-def waiting(push, first):
-    """The quasi-static schedule after a fifth of a second with other torques."""
+def waiting(push, first, then):
+    """The quasi-static schedule after a fifth of a second in which torques go from one to another."""
     half = len(push.values) // 2
-    values = [first, first, push.values[0], push.values[half - 1], push.values[half], push.values[-1]]
+    values = [first, then, push.values[0], push.values[half - 1], push.values[half], push.values[-1]]
     return wa.torque([0.0, 0.2, 0.2, 1.0, 1.0, 2.0], values)
 
 
-@pytest.mark.parametrize(("share", "apart", "held"), [(0.2, 0.0, True), (0.0, 0.05, False)])
-def test_an_object_waits_only_where_some_forces_hold_it(scene, schedule, share, apart, held):
+@pytest.mark.parametrize("ways", [("squeeze", "squeeze"), ("open", "open"), ("squeeze", "open"), ("open", "squeeze")])
+def test_an_object_waits_only_where_some_forces_hold_it(scene, schedule, ways):
     """Fingers that open gently do not move the object as far as accelerations tell, but nothing holds it either."""
-    torque = waiting(schedule, share * schedule.values[0] + apart * np.array([-1.0, 1.2]))
+    torques = {"squeeze": 0.2 * schedule.values[0], "open": np.array([-0.05, 0.06])}
+    torque, held = waiting(schedule, *(torques[way] for way in ways)), "open" not in ways
     alone = wa.simulate(scene, torque, arrival=ARRIVAL)
     assert alone.phases[0].holds[0].start == 0.0, "it waits"
     assert (alone.phases[0].holds[0].lost is None) is held

@@ -17,7 +17,7 @@ from wholearm_jax.batch import Checked
 from wholearm_jax.store import TYPES, StoreError, identity, open_store
 
 zarr = pytest.importorskip("zarr")
-COUNT, CHUNK, KILLS = 6, 1, 2
+COUNT, CHUNK, KILLS = 12, 1, 2
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +53,11 @@ def contents(path: Path) -> dict[str, bytes]:
     return {name: np.asarray(group[name][:]).tobytes() for name in [*TYPES, "done"]}
 
 
+def done(path: Path) -> int:
+    """How many chunks of a store are."""
+    return int(np.frombuffer(contents(path)["done"], "uint8").sum())
+
+
 @pytest.fixture(scope="module")
 def whole(command, tmp_path_factory):
     """What an uninterrupted process leaves."""
@@ -64,16 +69,19 @@ def whole(command, tmp_path_factory):
 
 
 def test_killed_at_any_moment_it_goes_on_to_the_same_store(command, whole, tmp_path):
-    path, moments = tmp_path / "killed.zarr", random.Random(1)
-    for _ in range(KILLS):
+    """First as soon as something is there to go on with, then at random."""
+    path, moments, left = tmp_path / "killed.zarr", random.Random(1), []
+    for kill in range(KILLS):
         process = start(command, path)
         until = path / "done" / "zarr.json"
-        while process.poll() is None and not until.exists():
-            time.sleep(0.02)
-        time.sleep(moments.uniform(0.0, 4.0))
+        while process.poll() is None and not (until.exists() and (kill or done(path))):
+            time.sleep(0.01)
+        time.sleep(moments.uniform(0.0, 4.0) if kill else 0.0)
         process.kill()
         process.communicate()
-        assert np.isin(np.frombuffer(contents(path)["done"], "uint8"), (0, 1)).all()  # it can always be read
+        left.append(done(path))  # it can always be read
+    assert 0 < left[0] < COUNT
+    assert left == sorted(left), "what was done stays done"
     finish(start(command, path))
     assert contents(path) == whole
 

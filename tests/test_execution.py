@@ -254,7 +254,7 @@ def test_error_shrinks_with_the_time_step(name, predictions, executions):
 
 
 def test_a_plan_predicted_to_fail_fails(predictions):
-    """Half the torque does not move the object."""
+    """A tenth of the torque does not move the object."""
     torque = predictions["heptagon"].torque
     weak = wa.simulate(predictions["heptagon"].scene, eqx.tree_at(lambda t: t.values, torque, 0.1 * torque.values))
     assert weak.status.label != "ok"

@@ -80,6 +80,8 @@ def test_the_search_is_beaten_in_margin(optimised):
     _, scene, found = optimised
     baseline = wa.search(scene)
     assert baseline.simulations > 10
+    assert any(phase.status is wa.Status.OK for phase in baseline.result.phases)
+    assert float(np.abs(baseline.torque.values).max()) <= 1.0, "beyond the torque limits"
     for phase, top in zip(baseline.result.phases, found.bounds, strict=True):
         assert phase.margin <= float(top.value) + 1e-9 or phase.status is not wa.Status.OK
     assert baseline.result.status is not wa.Status.OK or baseline.result.margin < found.result.margin

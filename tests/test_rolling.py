@@ -268,7 +268,7 @@ def test_bound_and_hold_see_the_cone(rolling):
     grip, tangential = np.asarray(table.grip), np.asarray(table.tangential)
     slack = np.where(tangential, grip * np.roll(forces, 1, axis=1) - np.abs(forces), forces).min(1)
     slack[np.any(np.abs(tau) > np.asarray(table.torque_limit), axis=1)] = -np.inf
-    assert float(found.margin) == pytest.approx(slack.max(), abs=2e-3 * np.abs(forces).max())
+    assert float(found.margin) == pytest.approx(slack.max(), abs=2e-3)
     assert float(found.margin) >= slack.max() - 1e-12
     at = jax.vmap(lambda s: squeeze.hold(table, s).margin)(table.breaks[0] + table.length * jnp.linspace(0.0, 1.0, 65))
     assert float(squeeze.bound(table, jnp.asarray(DURATION), False, False).value) >= float(at.min()) - 1e-9

@@ -97,10 +97,14 @@ def _search_phase(at: Traced, longest: float) -> tuple[np.ndarray, float, int]:
 
 
 def _raise(table, share: float, longest: float) -> tuple[np.ndarray, float, Status, float, int]:
-    """One series of raises from the best hold within a share of the torque limits: the last that worked, if one did."""
+    """One series of raises from the best hold within a share of the torque limits: the last that worked, or of those
+    that failed the one with the largest margin."""
     limit = np.asarray(table.torque_limit)
     tight = eqx.tree_at(lambda t: t.torque_limit, table, share * table.torque_limit)
-    torque = np.asarray(_hold(tight, table.breaks[0]).torque)
+    begin = _hold(tight, table.breaks[0])
+    torque = np.clip(np.asarray(begin.torque), -share * limit, share * limit)
+    if not np.isfinite(float(begin.margin)):  # no torque within this share balances
+        return torque, longest, Status.STUCK, -np.inf, 0
     pull = np.asarray(_coefficients(table, table.breaks[0])[0])[3:]
     # The pushing finger is the one whose torque, raised in its own direction, accelerates the object more.
     pushing = int(np.argmax(pull * np.sign(torque)))
@@ -109,7 +113,8 @@ def _raise(table, share: float, longest: float) -> tuple[np.ndarray, float, Stat
     while going and count < MOST:
         count += 1
         status, margin, end = _attempt(table, torque, longest)
-        if (status is Status.OK, margin) > (kept[2] is Status.OK, -np.inf):
+        margin = margin if np.isfinite(margin) else -np.inf  # what never moves has no least force
+        if status is Status.OK or (kept[2] is not Status.OK and margin > kept[3]):
             kept = (torque, end, status, margin)
         opened = status is Status.CONTACT_LOST and kept[2] is Status.OK
         torque = np.where(np.arange(2) == pushing, STEP * torque, torque)

@@ -19,7 +19,7 @@ from wholearm_jax.arguments import TORQUE, BadInput, SceneName, note, note_limit
 from wholearm_jax.settings import configure
 
 BESIDE = (".json", ".png", ".svg", ".pdf")  # what stands beside a store, under its name
-MANY = 100_000  # scenes from which on compiling well, which takes 1.6 times as long, pays (`benchmarks/batch.py`)
+MANY = 250_000  # scenes from which on compiling well, which takes 1.5 times as long, pays (`benchmarks/batch.py`)
 ARRIVAL = 0.01  # share of the wire: perturbed plans cannot end where an unperturbed one must
 Vary = Annotated[list[str] | None, typer.Option("--vary", help="QUANTITY=AMOUNT, e.g. vertices=0.0005, friction=20%.")]
 

@@ -91,7 +91,8 @@ def draw_execution_forces(execution: Execution, ax: Axes | None = None) -> Axes:
         ax.plot(expected.time, predicted, color=colour, lw=3.5, alpha=0.35, solid_capstyle="butt")
         executed = execution.course.cn[:, column]
         ax.plot(execution.course.time, np.where(executed > 0, executed, np.nan), color=colour, lw=0.9, label=name)
-    high = np.nanmax(np.where(np.isfinite(expected.cn), expected.cn, 0.0))
+    # What contacts do as they are made would hide the rest; where no forces are predicted, they are all there is.
+    high = np.nanmax(np.where(np.isfinite(expected.cn), expected.cn, 0.0)) or execution.course.cn.max() or 1.0
     ax.set_ylim(-0.03 * high, 1.35 * high)
     ax.plot([], [], color=PALE, lw=3.5, alpha=0.6, label="predicted")
     ax.set_ylabel("contact force $c_n$ [N]")

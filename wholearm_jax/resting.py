@@ -20,7 +20,7 @@ from wholearm_jax.phase import Outcome
 from wholearm_jax.reduction import Table, balance, on_panel, powers
 from wholearm_jax.result import BRIEF
 from wholearm_jax.scene import Formation, Scene, body
-from wholearm_jax.schedule import Torque, Window, interval, torque_in, window
+from wholearm_jax.schedule import ROUNDING, Torque, Window, torque_in, window
 from wholearm_jax.system import System, system
 
 
@@ -53,8 +53,12 @@ def _proved(mechanics: System, table: Table, seen: Window, motion: Motion, k) ->
     )
     friction = mechanics.contacts.friction
     sliding = -pick(table.tension, piece) / jnp.where(friction > 0, friction, 1.0)  # signs of slip, as traced
-    ends = jnp.stack([torque_in(seen, interval(seen, at), at) for at in (begin, end)])
-    inside = (seen.share > begin) & (seen.share < end)
+    # At a step the torque is that before it where a rest ends, and that behind it where one begins.
+    near = ROUNDING * jnp.finfo(end.dtype).eps
+    first, last = (seen.share <= begin + near).sum() - 1, (seen.share < end - near).sum() - 1
+    rows = (jnp.clip(row, seen.first, seen.last) for row in (first, last))
+    ends = jnp.stack([torque_in(seen, row, at) for row, at in zip(rows, (begin, end), strict=True)])
+    inside = (seen.share > begin + near) & (seen.share < end - near)
     corners = jnp.concatenate([ends, jnp.where(inside[:, None], seen.values, ends[0])]) / mechanics.torque_unit
     terms = jnp.concatenate([jnp.ones_like(corners[:, :1]), corners], axis=1)
 

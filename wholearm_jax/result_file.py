@@ -135,14 +135,14 @@ def execution_summary(execution: Execution, robustness: Robustness | None = None
         "angle_error": execution.angle_error,
         "creep": execution.creep,
     }
-    within = {"tolerance": execution.tolerance._asdict(), "open_at_end": list(execution.open_at_end)}
+    within = {"tolerance": _plain(execution.tolerance._asdict()), "open_at_end": list(execution.open_at_end)}
     events = [event._asdict() for event in execution.events]
     prediction = {"status": execution.prediction.status.label, "margin": execution.prediction.margin}
     row = _plain(head | errors) | within | {"events": events, "prediction": _plain(prediction)}
     if robustness is not None:
         low, high = robustness.interval
         row["perturbed"] = {
-            "amounts": robustness.amounts._asdict(),
+            "amounts": _plain(robustness.amounts._asdict()),
             "seed": robustness.seed,
             "executions": len(robustness.runs),
             "successes": robustness.successes,

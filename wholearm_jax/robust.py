@@ -149,13 +149,14 @@ def _climb(torque: Torque, scene, traced, arrival, how: Integration) -> _Climbed
             ends = zip(scene.phases, found, at, strict=True)
             missed = jnp.stack([_missed(o, t.table, p.arrive, arrival) for p, o, t in ends]).sum()
             holds = jnp.stack([o.verdict.status == int(Status.OK) for o in found]).all()
-            return least, missed, holds
+            moves = jnp.stack([jnp.isfinite(o.score.margin) for o in found]).all()
+            return least, missed, holds, moves
 
-        margins, missed, holds = jax.vmap(one)(traced)
+        margins, missed, holds, moves = jax.vmap(one)(traced)
         weights = jnp.full(margins.shape, 1.0 / margins.shape[0])
         scale = jnp.maximum(jnp.abs(jax.lax.stop_gradient(margins)).max(), 1e-3)
         low, _ = smooth_margin(margins, weights, TEMPERATURE * scale)
-        return low - scale * missed.mean(), (margins, holds)
+        return low - scale * missed.mean(), (jnp.where(moves, margins, -jnp.inf), holds)
 
     slope, (margins, holds) = jax.grad(objective, has_aux=True)(torque.values)
     return _Climbed(margins, holds, slope)

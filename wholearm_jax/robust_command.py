@@ -36,6 +36,8 @@ def optimise_robustly(
     result = simulate(varied.scene, found.torque, arrival=arrival)
     nominal, robust = found.unseen
     more = {"command": "optimise --robust", "knots": knots, "steps": steps, "varied": samples, "arrival": arrival}
+    amounts = (f"{name}={100 * a.size:g}%" if a.relative else f"{name}={a.size:g}" for name, a in varied.amounts)
+    more |= {"robust": ", ".join(amounts), "seed": varied.seed}
     more |= {"unseen_share": robust.share, "unseen_margin": robust.margin}
     more |= {"unseen_share_nominal": nominal.share, "unseen_margin_nominal": nominal.margin}
     tops = tuple(float(b.value) for b in bounds(varied.scene))

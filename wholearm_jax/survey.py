@@ -90,12 +90,15 @@ def survey(scene: Scene, chunks: Iterable[Checked], count: int) -> Survey:
 
 
 def influences(margins: Float[np.ndarray, "n"], shifts: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "p"]:
-    """Spearman's rank correlation of the margin with each parameter; 0 for one that does not vary."""
-    ranks = np.argsort(np.argsort(margins))
+    """Spearman's rank correlation of the margin with each parameter, like values sharing the mean of their ranks; 0
+    where either does not vary."""
+    from scipy.stats import rankdata  # takes half a second to import
+
+    ranks = rankdata(margins)
     found = []
     for column in shifts.T:
         varies = len(margins) > 1 and np.ptp(column) > 0 and np.ptp(ranks) > 0
-        found.append(np.corrcoef(ranks, np.argsort(np.argsort(column)))[0, 1] if varies else 0.0)
+        found.append(np.corrcoef(ranks, rankdata(column))[0, 1] if varies else 0.0)
     return np.asarray(found)
 
 

@@ -70,7 +70,7 @@ def _draw_influence(influence: dict[str, float], ax: Axes, most: int = 8) -> Non
 
 
 def _draw_map(told: Survey, parameters: Sequence[tuple[str, np.ndarray]], ax: Axes) -> None:
-    """The mean margin in squares that hold two dozen scenes or more."""
+    """The mean margin in squares of two dozen scenes on average, but no more than 40 a side."""
     (across, x), (up, y) = parameters
     finite = np.isfinite(told.margins)
     edges = np.linspace(-1.0, 1.0, int(np.clip(np.sqrt(finite.sum() / 24), 2, 40)) + 1)
