@@ -241,8 +241,7 @@ def _summary(cases: list[Case]) -> dict:
     rows = [row for case in cases for row in case.phases]
     held = [row for row in rows if row.optimise_status == "ok"]
     against = [row.optimise / row.best for row in held if row.best > 0]
-    searches = list({case.plan: case for case in reversed(cases)}.values())  # one a plan: its durations are its own
-    searched = [row for case in searches for row in case.phases]
+    searched = _searched(cases)
     at_one = [row for case in cases if case.duration == 1.0 for row in case.phases if row.optimise_status == "ok"]
     return {
         "phases": len(rows),
@@ -274,6 +273,12 @@ def _summary(cases: list[Case]) -> dict:
     }
 
 
+def _searched(cases: list[Case]) -> list[PhaseRow]:
+    """The phases of one case a plan, the first: the search chooses its own durations, and runs once."""
+    once = {case.plan: case for case in reversed(cases)}
+    return [row for case in once.values() for row in case.phases]
+
+
 def _spread(values: list[float]) -> dict[str, float] | None:
     if not values:
         return None
@@ -291,7 +296,7 @@ def draw(cases: list[Case], path) -> None:
     losses = {
         "optimise": [1 - r.optimise / r.bound if r.optimise_status == "ok" else np.inf for r in rows],
         "collocation": [1 - r.collocation / r.bound if r.collocation_status == "ok" else np.inf for r in rows],
-        "search": [1 - r.search / r.bound if r.search_status == "ok" else np.inf for r in rows],
+        "search": [1 - r.search / r.bound if r.search_status == "ok" else np.inf for r in _searched(cases)],
     }
     if any(row.reference for row in rows):
         losses["best known"] = [1 - r.best / r.bound if r.best > 0 else np.inf for r in rows]

@@ -320,7 +320,8 @@ def check_tables(
     where = jnp.where(failed.any(), jnp.argmax(failed), jnp.argmin(stops.margin))
     last = jnp.where(failed.any(), where, len(scene.phases) - 1)
     # What follows a failure counts for nothing but the margin; where it has none, that is known.
-    needed = (jnp.arange(len(scene.phases)) <= last) | (stops.status != int(Status.NO_CONVERGENCE))
+    counts = jnp.arange(len(scene.phases)) <= last
+    needed = counts | (stops.status != int(Status.NO_CONVERGENCE))
     ok = ~failed.any()
     answer = Checked(
         status=stops.status[where],
@@ -331,7 +332,7 @@ def check_tables(
         end=stops.end[last],
     )
     # Where only a linear programme can tell whether friction holds a rest, `simulate` asks it.
-    doubtful = jnp.any(~stops.held & (jnp.arange(len(scene.phases)) <= last))
+    doubtful = jnp.any(~stops.held & counts)
     return answer, jnp.select([jnp.any(~stops.good & needed), doubtful], [FINER, ALONE], GOOD)
 
 

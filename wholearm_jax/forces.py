@@ -100,7 +100,7 @@ def on_arc(one: Arcs, xi: Float[Array, ""]):
     width = one.share[1] - one.share[0]
     s = polynomial(one.quintic, xi)
     slope = polynomial(derivative(one.quintic), xi)
-    moving = one.live & ~one.held & (width > 0)
+    moving = one.live & ~one.held
     return one.share[0] + xi * width, s, jnp.where(moving, slope / jnp.where(moving, width, 1.0), 0.0)
 
 

@@ -171,15 +171,16 @@ def write_execution(execution: Execution, path: str | Path, samples: int = 201) 
 
 def discard(folder: Path) -> None:
     """Remove what an earlier result left in a folder: files of two results beside each other would mislead."""
-    figures = (f"{name}.{kind}" for name in ("plan", "result") for kind in ("png", "svg", "pdf"))
-    for name in ("torque.csv", "trajectory.csv", "summary.json", "report.html", *figures):
-        (folder / name).unlink(missing_ok=True)
+    _remove(folder, ("torque.csv", "trajectory.csv", "summary.json", "report.html"), ("plan", "result"))
 
 
 def discard_execution(folder: Path) -> None:
     """The same for what an earlier execution left."""
-    figures = (f"{name}.{kind}" for name in ("execution", "frames") for kind in ("png", "svg", "pdf"))
-    for name in ("execution.json", "execution.csv", "execution.gif", "model.xml", *figures):
+    _remove(folder, ("execution.json", "execution.csv", "execution.gif", "model.xml"), ("execution", "frames"))
+
+
+def _remove(folder: Path, files: tuple[str, ...], figures: tuple[str, ...]) -> None:
+    for name in (*files, *(f"{figure}.{kind}" for figure in figures for kind in ("png", "svg", "pdf"))):
         (folder / name).unlink(missing_ok=True)
 
 

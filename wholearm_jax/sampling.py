@@ -47,7 +47,6 @@ def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shar
     """A phase's motion at given shares of its duration; beyond its end the object rests there."""
     seen = window(schedule, start, duration)
     steps = arcs(table, seen, duration, motion)
-
     rows = jnp.arange(steps.live.shape[0])
 
     def one(share):

@@ -129,10 +129,8 @@ def shoot(table: Table, how: Integration, intervals: int, q: Float[Array, "cut 7
         after, samples = _one_part(table, how, intervals, one, pick(q, k))
         again = pick(come, one.piece)
         row = jnp.where(one.begun, jnp.where(again, spare, cut + one.piece), k)
-        at, parts = (
-            jax.tree.map(lambda a, new, place=place: a.at[place].set(new), old, fresh)
-            for old, fresh, place in ((at, after, k), (parts, samples, row))
-        )
+        at = jax.tree.map(lambda a, new: a.at[k].set(new), at, after)
+        parts = jax.tree.map(lambda a, new: a.at[row].set(new), parts, samples)
         come = come.at[one.piece].set(again | one.begun)
         return at, parts, owner.at[row].set(k), come, spare + (one.begun & again)
 
