@@ -1,6 +1,7 @@
 """What XLA is told: every loop compiled as one function, whatever a user has set left alone."""
 
 import os
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,9 @@ from wholearm_jax import settings
 def _jax_has_begun():
     """What these tests write to the environment comes too late for this process."""
     jax.devices()
+    lines = jax.config.values["jax_traceback_in_locations_limit"]
+    yield
+    jax.config.update("jax_traceback_in_locations_limit", lines)
 
 
 def test_a_loop_is_one_function():
@@ -32,7 +36,7 @@ def test_a_loop_is_one_function():
         (
             "quickly",
             "--xla_cpu_use_fusion_emitters=true --xla_backend_extra_options=one=2",
-            ["--xla_cpu_use_fusion_emitters=true", "--xla_backend_extra_options=one=2", settings.QUICKLY[1]],
+            ["--xla_cpu_use_fusion_emitters=true", "--xla_backend_extra_options=one=2", *settings.QUICKLY[1:]],
         ),
     ],
 )
@@ -42,6 +46,20 @@ def test_what_a_user_has_set_stays(monkeypatch, compiled, given, left):
     assert os.environ["XLA_FLAGS"].split() == left
     wa.configure(compiled=compiled)
     assert os.environ["XLA_FLAGS"].split() == left
+
+
+@pytest.mark.parametrize(
+    ("compiled", "given", "carried"), [("quickly", None, False), ("quickly", "3", True), ("well", None, True)]
+)
+def test_programs_carry_lines_of_python_where_they_are_wanted(monkeypatch, compiled, given, carried):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.delenv("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", raising=False)
+    jax.config.update("jax_traceback_in_locations_limit", 3)  # as JAX reads it from its environment when imported
+    if given:
+        monkeypatch.setenv("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", given)
+    wa.configure(compiled=compiled)
+    traced = jax.jit(lambda x: jnp.sin(x) + 1.0).lower(1.0)
+    assert (Path(__file__).name in traced.as_text(debug_info=True)) == carried
 
 
 def test_another_version_of_jax_is_told_nothing(monkeypatch):

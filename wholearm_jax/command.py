@@ -3,6 +3,7 @@
 Exit status 0 when the result is `ok`, 1 when the plan fails (its status is printed), 2 for bad input, in one line.
 """
 
+import gc
 import os
 import sys
 import time
@@ -50,6 +51,8 @@ def main() -> None:
     # Solving small systems on several threads costs more than it gains: they wait for one another, spinning.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("MPLBACKEND", "agg")
+    # Tracing makes many objects, nearly all to stay: looking through them for garbage took a twentieth of a first run.
+    gc.set_threshold(100_000, 20, 20)
     if sys.argv[1:2] != ["check"]:  # which knows itself how many scenes there are to compile for
         configure()
     _keep_compiled()

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 def require_x64() -> None:
     """Raise unless JAX computes in 64 bits: the statuses' tolerances need them."""
-    if jnp.zeros(()).dtype != jnp.float64:
+    if jnp.result_type(float) != jnp.float64:  # an array would wait for the compiler while programs compile beside
         raise RuntimeError("this function needs float64; call wholearm_jax.configure() before JAX computes anything")
 
 

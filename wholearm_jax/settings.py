@@ -6,7 +6,11 @@ from typing import Literal
 import jax
 
 ALWAYS = ("--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000",)
-QUICKLY = ("--xla_cpu_use_fusion_emitters=false", "--xla_backend_optimization_level=1")
+QUICKLY = (
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_backend_optimization_level=1",
+    "--xla_disable_hlo_passes=while-loop-invariant-code-motion",
+)
 MEASURED = (0, 10)  # XLA refuses flags that it does not know: these are for the version of JAX that was measured
 
 
@@ -15,9 +19,10 @@ def configure(*, compiled: Literal["quickly", "well"] = "quickly") -> None:
 
     Every loop becomes one function: by default XLA runs a loop of such small steps as a sequence of kernels, each of
     which costs more to start than it computes. A margin takes 0.75 of the time then, its gradient 0.2 to 0.3. Compiled
-    `"quickly"`, as suits single scenes, kernels come from XLA's older emitters and are optimised little: half of the
-    compile time. Compiled `"well"`, as suits `check`, very many scenes run faster by an eighth. What `XLA_FLAGS` in the
-    environment says already stays as it is.
+    `"quickly"`, as suits single scenes, kernels come from XLA's older emitters and are optimised little, and programs
+    do not carry the lines of Python that a profiler would show: half of the compile time. Compiled `"well"`, as suits
+    `check`, very many scenes run faster by an eighth. What `XLA_FLAGS` and `JAX_TRACEBACK_IN_LOCATIONS_LIMIT` in the
+    environment say already stays as it is.
 
     >>> wa.configure()
     """
@@ -25,6 +30,9 @@ def configure(*, compiled: Literal["quickly", "well"] = "quickly") -> None:
     if jax.__version_info__[:2] != MEASURED:
         return
     given = os.environ.get("XLA_FLAGS", "")
-    wanted = (*ALWAYS, *(QUICKLY if compiled == "quickly" else ()))
+    quickly = compiled == "quickly"
+    if quickly and "JAX_TRACEBACK_IN_LOCATIONS_LIMIT" not in os.environ:
+        jax.config.update("jax_traceback_in_locations_limit", 0)
+    wanted = (*ALWAYS, *(QUICKLY if quickly else ()))
     added = [flag for flag in wanted if flag.partition("=")[0] not in given]
     os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
