@@ -1,10 +1,12 @@
 """What functions need of their arguments is said at once, by name, before anything is computed."""
 
+import jax
 import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.execution import execute
 from wholearm_jax.perturbation import Amounts, perturb
+from wholearm_jax.requirements import require_x64
 from wholearm_jax.variation import vary
 
 
@@ -46,3 +48,21 @@ WRONG = {
 def test_arguments_that_make_no_sense(call, message, plan):
     with pytest.raises(ValueError, match=message):
         call(*plan)
+
+
+def test_who_asks_for_float64_does_not_wait_for_the_compiler():
+    """Programs that compile beside hold up every array that is computed meanwhile, by seconds."""
+    begun = []
+
+    def listen(event, _seconds, **_):
+        begun.append(event)
+
+    jax.clear_caches()
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        require_x64()
+        assert not [event for event in begun if "backend_compile" in event]
+        jax.numpy.zeros(())
+        assert [event for event in begun if "backend_compile" in event]
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
