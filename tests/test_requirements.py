@@ -1,12 +1,13 @@
 """What functions need of their arguments is said at once, by name, before anything is computed."""
 
-import jax
+import subprocess
+import sys
+
 import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.execution import execute
 from wholearm_jax.perturbation import Amounts, perturb
-from wholearm_jax.requirements import require_x64
 from wholearm_jax.variation import vary
 
 
@@ -50,6 +51,16 @@ def test_arguments_that_make_no_sense(call, message, plan):
         call(*plan)
 
 
-def test_who_asks_for_float64_does_not_wait_for_the_compiler():
+TOLD_WHAT_JAX_DOES = """
+import jax
+from wholearm_jax.requirements import require_x64
+jax.config.update("jax_enable_x64", True)
+jax.monitoring.register_event_duration_secs_listener(lambda event, _, **__: print(event))
+"""
+
+
+@pytest.mark.parametrize(("call", "compiles"), [("require_x64()", False), ("jax.numpy.zeros(())", True)])
+def test_who_asks_for_float64_does_not_wait_for_the_compiler(call, compiles):
     """Programs that compile beside hold up every array that is computed meanwhile, by seconds."""
-    assert jax.make_jaxpr(require_x64)().eqns == []
+    run = subprocess.run([sys.executable, "-c", TOLD_WHAT_JAX_DOES + call], capture_output=True, text=True, check=True)
+    assert ("backend_compile" in run.stdout) == compiles
