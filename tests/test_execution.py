@@ -182,9 +182,9 @@ def test_contact_forces_and_weight_change_the_momentum(name, executions):
     solid = body(scene.object)
     several = contacts(solid, scene.hand, formation(executions[name].names))
     at = jax.vmap(frames, (None, 0))(several, course.z)
-    n = np.asarray(at.normal)
+    n = np.stack(at.normal, axis=-1)
     force = course.cn[..., None] * n + course.ct[..., None] * np.stack([n[..., 1], -n[..., 0]], axis=-1)
-    arm = np.asarray(at.from_object)
+    arm = np.stack(at.from_object, axis=-1)
     moment = (arm[..., 0] * force[..., 1] - arm[..., 1] * force[..., 0]).sum(1)
     total = force.sum(1) + float(solid.mass) * np.asarray(scene.gravity)
     gained = np.diff(course.z_dot, axis=0) / executions[name].timestep

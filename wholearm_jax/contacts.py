@@ -34,6 +34,10 @@ GROUPS = (
 """Link (of the palm's ends: the finger beside it) and kind of all that may meet, each with every feature in turn."""
 HELD = 5  # of these groups are contacts that a formation may hold
 
+Vector = tuple[Float[Array, "*contacts"], Float[Array, "*contacts"]]
+"""A vector for each contact, by components: put together they would be taken apart again by what is computed next, in
+kernels that do nothing else."""
+
 
 class Contacts(eqx.Module):
     """Contacts as arrays; the leading axis runs over the constraints of a formation (`Formation`).
@@ -43,13 +47,13 @@ class Contacts(eqx.Module):
     """
 
     on_link: Bool[Array, "slots"]
-    finger: Float[Array, "slots 2"]
+    finger: Vector
     side: Float[Array, "slots"]
-    joint: Float[Array, "slots 2"]
+    joint: Vector
     reach: Float[Array, "slots"]
     offset: Float[Array, "slots"]
-    point: Float[Array, "slots 2"]
-    edge: Float[Array, "slots 2"]
+    point: Vector
+    edge: Vector
     lower: Float[Array, "slots"]
     upper: Float[Array, "slots"]
     friction: Float[Array, "slots"]
@@ -61,11 +65,11 @@ class Contacts(eqx.Module):
 class Frame(eqx.Module):
     """A contact at one configuration: gap `C`, place `along` its feature, normal, point against `q` and against `j`."""
 
-    gap: Float[Array, ""]
-    along: Float[Array, ""]
-    normal: Float[Array, "2"]
-    from_object: Float[Array, "2"]
-    from_joint: Float[Array, "2"]
+    gap: Float[Array, "*contacts"]
+    along: Float[Array, "*contacts"]
+    normal: Vector
+    from_object: Vector
+    from_joint: Vector
 
 
 def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
@@ -84,15 +88,19 @@ def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
     along_palm = np.array([1.0, 0.0])  # which ends beside the fingers' joints, these wherever they are
     palm_lower, palm_upper = hand.joint[1, 0], hand.joint[0, 0]
     reach = finger @ hand.length
+
+    def components(vectors) -> Vector:
+        return vectors[:, 0], vectors[:, 1]
+
     return Contacts(
         on_link=on_link,
-        finger=finger,
+        finger=components(finger),
         side=jnp.where(formation.link == 2, -1.0, 1.0).astype(body.mass.dtype),
-        joint=of_finger @ hand.joint * jnp.where(of_palm, along_palm, 1.0),
+        joint=components(of_finger @ hand.joint * jnp.where(of_palm, along_palm, 1.0)),
         reach=jnp.where(corner, 0.0, reach),
         offset=finger @ hand.offset,
-        point=start,
-        edge=extent / length[:, None],
+        point=components(start),
+        edge=components(extent / length[:, None]),
         lower=jnp.where(on_link & palm, palm_lower, beside),
         upper=jnp.where(on_link, jnp.where(palm, palm_upper, reach), length - beside),
         friction=body.friction[formation.link],
@@ -127,16 +135,9 @@ def _on_features(groups, capacity: int) -> Formation:
 def frames(several: Contacts, z: Float[Array, "5"]) -> Frame:
     """Contacts (or one, without a leading axis) at configuration `z`.
 
-    Written by components: a vector is put together only where all its parts are done, which compiles to a seventh of
-    the kernels that small matrix products take.
+    Written by components: that compiles to a seventh of the kernels that small matrix products take.
     """
-
-    def components(vectors):
-        return vectors[..., 0], vectors[..., 1]
-
-    (px, py), (ex, ey), (jx, jy), (first, second) = map(
-        components, (several.point, several.edge, several.joint, several.finger)
-    )
+    (px, py), (ex, ey), (jx, jy), (first, second) = several.point, several.edge, several.joint, several.finger
     cosines, sines = _cosines_and_sines(z[2:])
     c, s = cosines[0], sines[0]
     dx = (1 - first - second) + first * cosines[1] + second * cosines[2]  # along the link
@@ -153,9 +154,9 @@ def frames(several: Contacts, z: Float[Array, "5"]) -> Frame:
     return Frame(
         gap=jnp.where(on, lx * rx + ly * ry - several.offset, -(nx * tx + ny * ty)),
         along=jnp.where(on, dx * rx + dy * ry, ex * tx + ey * ty),
-        normal=jnp.stack([jnp.where(on, lx, nx), jnp.where(on, ly, ny)], axis=-1),
-        from_object=jnp.stack([wx - z[0], wy - z[1]], axis=-1),
-        from_joint=jnp.stack([wx - jx, wy - jy], axis=-1),
+        normal=(jnp.where(on, lx, nx), jnp.where(on, ly, ny)),
+        from_object=(wx - z[0], wy - z[1]),
+        from_joint=(wx - jx, wy - jy),
     )
 
 
@@ -243,7 +244,7 @@ def constraint_curvature(several: Contacts, z: Float[Array, "5"], x: Float[Array
     """
     at, on, (dx, dy), turn = frames(several, z), several.on_link, (x[0], x[1]), x[2]
     swing = _swing(several, x)
-    (nx, ny), (ox, oy), (jx, jy) = ((a[:, 0], a[:, 1]) for a in (at.normal, at.from_object, at.from_joint))
+    (nx, ny), (ox, oy), (jx, jy) = at.normal, at.from_object, at.from_joint
     rx, ry = ny * at.along - nx * at.gap, -nx * at.along - ny * at.gap  # B: from the edge's start to the tip
     rx, ry = jnp.where(on, jx, rx), jnp.where(on, jy, ry)
     bx, by = jnp.where(on, ox, ox - rx), jnp.where(on, oy, oy - ry)  # the object's point, from its origin
@@ -263,18 +264,20 @@ def _sense(several: Contacts) -> Float[Array, "slots"]:
     return jnp.where(several.on_link, several.side, -1.0)
 
 
-def _constrained(several: Contacts, at: Frame) -> Float[Array, "slots 2"]:
+def _constrained(several: Contacts, at: Frame) -> Vector:
     """The direction in which each constraint keeps the object from moving: the normal, or the tangent."""
-    return jnp.where(several.tangential[:, None], _turned(at.normal), at.normal)
+    (nx, ny), (tx, ty) = at.normal, _turned(at.normal)
+    return jnp.where(several.tangential, tx, nx), jnp.where(several.tangential, ty, ny)
 
 
-def _velocity_rows(several: Contacts, at: Frame, direction: Float[Array, "slots 2"]) -> Float[Array, "slots 5"]:
+def _velocity_rows(several: Contacts, at: Frame, direction: Vector) -> Float[Array, "slots 5"]:
     """Rows whose product with `z_dot` is the velocity along a direction at the contact, the object against the link."""
     ux, uy, turn, arm = _moments(at, direction)
-    return jnp.stack([ux, uy, turn, arm * several.finger[:, 0], arm * several.finger[:, 1]], axis=1)
+    first, second = several.finger
+    return jnp.stack([ux, uy, turn, arm * first, arm * second], axis=1)
 
 
-def _velocities(several: Contacts, at: Frame, direction: Float[Array, "slots 2"], x) -> Float[Array, "slots"]:
+def _velocities(several: Contacts, at: Frame, direction: Vector, x) -> Float[Array, "slots"]:
     """Those rows times `x`."""
     ux, uy, turn, arm = _moments(at, direction)
     return ux * x[0] + uy * x[1] + turn * x[2] + arm * _swing(several, x)
@@ -282,15 +285,16 @@ def _velocities(several: Contacts, at: Frame, direction: Float[Array, "slots 2"]
 
 def _swing(several: Contacts, x: Float[Array, "5"]) -> Float[Array, "slots"]:
     """How fast each contact's own link turns; the palm does not."""
-    return several.finger[:, 0] * x[3] + several.finger[:, 1] * x[4]
+    first, second = several.finger
+    return first * x[3] + second * x[4]
 
 
-def _moments(at: Frame, direction: Float[Array, "slots 2"]):
+def _moments(at: Frame, direction: Vector):
     """A direction's components, and its moments about the object's origin and, the other way, the link's joint."""
-    ux, uy = direction[:, 0], direction[:, 1]
-    turn = uy * at.from_object[:, 0] - ux * at.from_object[:, 1]
-    return ux, uy, turn, ux * at.from_joint[:, 1] - uy * at.from_joint[:, 0]
+    (ux, uy), (ox, oy), (jx, jy) = direction, at.from_object, at.from_joint
+    return ux, uy, uy * ox - ux * oy, ux * jy - uy * jx
 
 
-def _turned(normal: Float[Array, "contacts 2"]) -> Float[Array, "contacts 2"]:
-    return jnp.stack([normal[:, 1], -normal[:, 0]], axis=1)
+def _turned(normal: Vector) -> Vector:
+    x, y = normal
+    return y, -x

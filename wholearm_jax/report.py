@@ -180,7 +180,7 @@ def _places(scene: Scene, formation, z: np.ndarray) -> np.ndarray:
     @jax.vmap
     def at(z):
         found = frames(several, z)
-        return jax.numpy.concatenate([z[:2] + found.from_object, found.normal], axis=1)
+        return jax.numpy.stack([z[0] + found.from_object[0], z[1] + found.from_object[1], *found.normal], axis=1)
 
     return np.asarray(at(z))[:, list(formation.normal_slots)]
 

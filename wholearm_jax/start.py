@@ -48,9 +48,10 @@ def misplaced(system, z):
     held, pairs = frames(system.contacts, z), frames(system.candidates, z)
     beyond = (held.along < system.contacts.lower - tolerance) | (held.along > system.contacts.upper + tolerance)
     inside = (pairs.along > system.candidates.lower) & (pairs.along < system.candidates.upper)
-    of_finger, held_by = system.candidates.finger > 0, (system.contacts.finger > 0) & system.contacts.on_link[:, None]
-    faces = ~of_finger.any(1) | (system.convex & (of_finger & held_by.any(0)).any(1))  # in front of them all must be
-    behind = system.watched & system.candidates.on_link & faces & inside & (pairs.gap < -tolerance)
+    behind = system.watched & system.candidates.on_link & inside & (pairs.gap < -tolerance)
+    for of_finger, held_by in zip(system.candidates.finger, system.contacts.finger, strict=True):
+        holds = jnp.any((held_by > 0) & system.contacts.on_link)
+        behind &= (of_finger == 0) | (system.convex & holds)  # an object may lie beyond the line of any other finger
     return jnp.any(beyond) | jnp.any(behind) | _pierced(system, pairs, tolerance)
 
 
