@@ -39,12 +39,12 @@ def anywhere(seed):
 def test_a_body_turns_by_its_angle(mechanics, angle):
     """Also where the tangent of half the angle is infinite but for rounding."""
     z = jnp.asarray([0.1, 0.2, angle, angle, angle])
-    vertex = np.stack(mechanics.candidates.point, axis=1)
+    vertex = np.stack(mechanics.candidates.point)
 
     def at(z):
         return frames(mechanics.candidates, z).from_object
 
-    turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ np.asarray(vertex).T
+    turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ vertex
     on = np.asarray(mechanics.candidates.on_link)
     np.testing.assert_allclose(np.stack(at(z), axis=1)[on], turned.T[on], atol=1e-15)
     slope = np.stack(jax.jacfwd(at)(z), axis=1)[on, :, 2]
