@@ -9,6 +9,7 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.robust import optimise_robustly
+from wholearm_jax.scene import replace_duration
 from wholearm_jax.variation import vary
 
 
@@ -104,3 +105,19 @@ def test_what_the_command_writes(slide, wholearm, tmp_path):
     again = wa.simulate(slide, wa.read_torque(tmp_path / "out" / "torque.csv"), arrival=0.02)
     assert again.margin == told["margin"]
     assert "share that holds of unseen scenes" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_an_object_that_waits_where_nothing_holds_it_does_not_hold(slide):
+    """Fingers that open gently do not move the object as far as accelerations tell, but nothing holds it either."""
+    both = wa.read_torque(Path(__file__).parent / "data" / "heptagon_torque.csv")
+    push = np.asarray(both.values[:51])
+    late = eqx.tree_at(lambda s: s.phases, slide, (replace_duration(slide.phases[0], 1.2),))
+    varied, share = vary(late, {"friction": "0.1%"}, seed=1), {}
+    for name, torque in (("squeeze", 0.2 * push[0]), ("open", np.array([-0.05, 0.06]))):
+        waiting = wa.torque([0.0, 0.2, *(0.2 + np.asarray(both.times[:51]))], [torque, torque, *push])
+        found = optimise_robustly(varied, samples=12, steps=1, arrival=0.02, nominal=waiting)
+        share[name] = found.seen[0].share
+        assert wa.simulate(varied.draw(0), waiting, arrival=0.02).status.label == (
+            "ok" if share[name] else "contact_lost"
+        )
+    assert share == {"squeeze": 1.0, "open": 0.0}

@@ -22,11 +22,13 @@ from jaxtyping import Array, Bool, Float
 
 from wholearm_jax.forces import smooth_margin
 from wholearm_jax.optimiser import optimise
-from wholearm_jax.phase import Traced
-from wholearm_jax.plan import outcomes, require_covered, require_motion, roomy, steps_within, trace
+from wholearm_jax.phase import Outcome, Traced
+from wholearm_jax.plan import outcomes, require_covered, require_motion, roomy, simulate, steps_within, trace
 from wholearm_jax.programs import Program
 from wholearm_jax.requirements import require_positive
-from wholearm_jax.schedule import Torque, beyond
+from wholearm_jax.resting import surely_held
+from wholearm_jax.scene import Scene
+from wholearm_jax.schedule import Torque, beyond, padded
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
 from wholearm_jax.variation import Ensemble
@@ -75,7 +77,8 @@ def optimise_robustly(
 
     `rate` is the step of Adam as a share of the torque limits. `nominal` starts from another schedule than
     `optimise(ensemble.scene)` finds. `callback` sees each step's number and how its schedule does on the samples.
-    Whether friction can hold the object where it waits is not asked of every sample, as `simulate` does of one scene.
+    A sample that would hold, but whose object waits where nothing proves that friction can keep it there (`resting`),
+    is simulated by itself.
     Raises ValueError for a plan that holds its object in a phase, for numbers that are not positive, and for a
     `nominal` schedule that is shorter than the plan or beyond the torque limits.
     """
@@ -85,14 +88,16 @@ def optimise_robustly(
     start = optimise(scene, knots=knots).torque if nominal is None else nominal
     require_covered(scene, start)
     _require_within(limit, start)
-    seen, unseen = (_traced(ensemble, jnp.arange(samples) + first) for first in (0, samples))
+    seen, unseen = (_sampled(ensemble, jnp.arange(samples) + first) for first in (0, samples))
     how = replace(roomy(HOW, scene, start), steps=steps_within(scene, start))
 
-    def tried(torque: Torque, traced) -> _Climbed:
-        return _climb(torque, scene, traced, jnp.asarray(arrival, float), how)
-
-    def held(found) -> Held:
-        return Held(float(np.asarray(found.holds).mean()), float(jnp.quantile(found.margins, quantile, method="lower")))
+    def tried(torque: Torque, sampled: _Sampled) -> tuple[_Climbed, Held]:
+        found = _climb(torque, sampled, jnp.asarray(arrival, float), how)
+        holds = np.array(found.holds)
+        for k in np.flatnonzero(holds & ~np.asarray(found.proved)):
+            alone = jax.tree.map(lambda leaf, k=k: leaf[k], sampled.scenes)
+            holds[k] = simulate(alone, torque, arrival=arrival).status is Status.OK
+        return found, Held(float(holds.mean()), float(jnp.quantile(found.margins, quantile, method="lower")))
 
     adam = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.05))
     share = start.values / limit
@@ -100,8 +105,7 @@ def optimise_robustly(
     best, nominally, best_held = start, None, Held(-1.0, -np.inf)
     for step in range(steps + 1):
         torque = Torque(start.times, share * limit)
-        found = tried(torque, seen)
-        now = held(found)
+        found, now = tried(torque, seen)
         if callback is not None:
             callback(step, now)
         nominally = nominally or now
@@ -114,7 +118,7 @@ def optimise_robustly(
         best,
         start,
         seen=(nominally, best_held),
-        unseen=(held(tried(start, unseen)), held(tried(best, unseen))),
+        unseen=(tried(start, unseen)[1], tried(best, unseen)[1]),
     )
 
 
@@ -124,42 +128,65 @@ def _require_within(limits, torque: Torque) -> None:
         raise ValueError(f"the nominal torque of finger {finger} is {reached:g} N m, its limit {limit:g} N m")
 
 
+class _Sampled(NamedTuple):
+    """Scenes along a leading axis, and for each phase their wires."""
+
+    scenes: Scene
+    traced: tuple[Traced, ...]
+
+
 class _Climbed(NamedTuple):
-    """Margins [N] of all samples, whether they hold, and the objective's derivative with respect to the torques."""
+    """Margins [N] of all samples, whether they hold, whether it is `proved` that friction can keep them wherever they
+    rest, and the objective's derivative with respect to the torques."""
 
     margins: Float[Array, "samples"]
     holds: Bool[Array, "samples"]
+    proved: Bool[Array, "samples"]
     slope: Float[Array, "rows 2"]
 
 
 @Program
-def _traced(ensemble: Ensemble, numbers) -> tuple[Traced, ...]:
-    """The wires of some scenes."""
-    return jax.lax.map(lambda n: trace(ensemble.draw(n), resolution=COARSE), numbers, batch_size=32)
+def _sampled(ensemble: Ensemble, numbers) -> _Sampled:
+    """Some scenes, traced."""
+
+    def one(number):
+        scene = ensemble.draw(number)
+        return _Sampled(scene, trace(scene, resolution=COARSE))
+
+    return jax.lax.map(one, numbers, batch_size=32)
 
 
 @Program
-def _climb(torque: Torque, scene, traced, arrival, how: Integration) -> _Climbed:
+def _climb(torque: Torque, sampled: _Sampled, arrival, how: Integration) -> _Climbed:
     """How a schedule does on all samples, and which way it gets better."""
 
     def objective(values) -> tuple[Float[Array, ""], tuple]:
-        def one(at):
+        def one(sample: _Sampled):
+            scene, at = sample
             found = outcomes(scene, Torque(torque.times, values), at, how, arrival)
             least = jnp.stack([jnp.where(jnp.isfinite(o.score.margin), o.score.margin, NONE) for o in found]).min()
             ends = zip(scene.phases, found, at, strict=True)
             missed = jnp.stack([_missed(o, t.table, p.arrive, arrival) for p, o, t in ends]).sum()
             holds = jnp.stack([o.verdict.status == int(Status.OK) for o in found]).all()
             moves = jnp.stack([jnp.isfinite(o.score.margin) for o in found]).all()
-            return least, missed, holds, moves
+            return least, missed, holds, moves, _rests_proved(sample, torque, found)
 
-        margins, missed, holds, moves = jax.vmap(one)(traced)
+        margins, missed, holds, moves, proved = jax.vmap(one)(sampled)
         weights = jnp.full(margins.shape, 1.0 / margins.shape[0])
         scale = jnp.maximum(jnp.abs(jax.lax.stop_gradient(margins)).max(), 1e-3)
         low, _ = smooth_margin(margins, weights, TEMPERATURE * scale)
-        return low - scale * missed.mean(), (jnp.where(moves, margins, -jnp.inf), holds)
+        return low - scale * missed.mean(), (jnp.where(moves, margins, -jnp.inf), holds, proved)
 
-    slope, (margins, holds) = jax.grad(objective, has_aux=True)(torque.values)
-    return _Climbed(margins, holds, slope)
+    slope, (margins, holds, proved) = jax.grad(objective, has_aux=True)(torque.values)
+    return _Climbed(margins, holds, proved, slope)
+
+
+def _rests_proved(sample: _Sampled, torque: Torque, found: tuple[Outcome, ...]) -> Bool[Array, ""]:
+    """Whether it is proved that friction can keep the object wherever it rests."""
+    scene, traced = sample
+    fixed = jax.lax.stop_gradient(found)
+    rows = zip(scene.phases, traced, fixed, strict=True)
+    return jnp.stack([surely_held(scene, p.formation, t.table, padded(torque), o) for p, t, o in rows]).all()
 
 
 def _missed(outcome, table, arrive: str, arrival):
