@@ -1,4 +1,4 @@
-"""The bound by its definition: linear programmes at places of the wire and speeds, solved by another's solver."""
+"""The bound and the best squeeze by their definitions: linear programmes, solved by another's solver."""
 
 import itertools
 
@@ -13,7 +13,7 @@ import wholearm_jax as wa
 from wholearm_jax import squeeze
 from wholearm_jax.squeeze import FASTEST, PLACES, SPEEDS
 
-coefficients, bound = jax.jit(squeeze.coefficients), jax.jit(squeeze.bound)
+coefficients, bound, hold = jax.jit(squeeze.coefficients), jax.jit(squeeze.bound), jax.jit(squeeze.hold)
 
 
 def largest_least_force(offset, slope, limits, forward=None):
@@ -64,3 +64,34 @@ def test_the_bound_is_the_least_of_the_best_forces(phase, duration, rests, limit
     assert float(top.s) == pytest.approx(float(table.breaks[0] + tight * table.length), rel=1e-12)
     for place in (0.0, *(np.random.default_rng(0).choice(np.arange(1, PLACES), 6) / PLACES), 1.0):
         assert best_at(table, duration, float(place), rests)[1] >= value - 1e-9
+
+
+@pytest.mark.parametrize("acceleration", [-3.0, 0.0, 20.0, 300.0])
+@pytest.mark.parametrize("idle", [False, True], ids=["both fingers drive", "the second only presses"])
+@pytest.mark.parametrize("limits", [(1.0, 1.0), (0.4, 1.5)])
+def test_the_best_squeeze_is_within_limits(limits, idle, acceleration):
+    """Where one finger alone drives the object the motion tells its torque, which may be beyond its limit."""
+    scene = eqx.tree_at(lambda s: s.hand.torque_limit, wa.load("heptagon"), jnp.asarray(limits))
+    table = wa.trace(scene)[0].table
+    if idle:
+        table = eqx.tree_at(lambda t: t.acceleration, table, table.acceleration.at[..., 4].set(0.0))
+    s, speed = table.breaks[0] + 0.4 * table.length, 0.5
+    motion, force = (np.asarray(a) for a in coefficients(table, s))
+    terms = np.array([1.0, speed**2, speed])
+    slacks = np.column_stack([-force[:, 3:], np.ones(len(force))])
+    wanted = acceleration * float(table.length)
+    answer = linprog(
+        [0.0, 0.0, -1.0],
+        A_ub=slacks,
+        b_ub=force[:, :3] @ terms,
+        A_eq=[[*motion[3:], 0.0]],
+        b_eq=[wanted - motion[:3] @ terms],
+        bounds=[*((-limit, limit) for limit in limits), (None, None)],
+    )
+    found = hold(table, s, jnp.asarray(speed), jnp.asarray(wanted))
+    if answer.status == 0:
+        assert float(found.margin) == pytest.approx(-answer.fun, rel=1e-9)
+        assert np.all(np.abs(found.torque) <= np.array(limits) * (1 + 1e-12))
+    else:
+        assert answer.status == 2
+        assert float(found.margin) == -np.inf

@@ -80,7 +80,8 @@ def hold(table: Table, s, v=0.0, a=0.0) -> Hold:
     tries = jnp.clip(jnp.concatenate([jnp.stack([low, high]), meets]), low, high)
     least = (offset + tries[:, None] * slope).min(1)
     best = jnp.argmax(least)
-    possible = (low <= high) & jnp.all(jnp.isfinite(least))
+    within = steep | (jnp.abs(base) <= table.torque_limit)  # a torque that is the same along all of the squeeze
+    possible = (low <= high) & jnp.all(within) & jnp.all(jnp.isfinite(least))
     margin = jnp.where(possible, least[best], -jnp.inf)
     return Hold(base + tries[best] * free, margin)
 
