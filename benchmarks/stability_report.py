@@ -1,4 +1,6 @@
-"""The stability sweep's table, JSON and figure."""
+"""The stability sweep's table, JSON and figure. On its own: the figure of the JSON that is kept, drawn anew."""
+
+import json
 
 import numpy as np
 from measure import RESULTS, save
@@ -9,11 +11,12 @@ from stability_sweep import EXCESSES, REASONS, RESIDUALS
 
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#999999"
+BINS = np.arange(-18.0, 1.01, 0.5)  # of the residuals' exponents
 NAMES = {
     "closure": "closure",
     "tangent": "tangent",
-    "columns": "equations, table",
-    "motion": "equations, motion",
+    "columns": "equations of motion, tables",
+    "motion": "equations of motion",
     "constraint": "constraint",
     "energy": "energy",
 }
@@ -38,6 +41,7 @@ def summary(found) -> dict:
         "residual_quantiles": {
             name: dict(zip(map(str, QUANTILES), quantiles(found[name]), strict=True)) for name in RESIDUALS + EXCESSES
         },
+        "residual_percent_by_exponent": {name: shares(found[name]) for name in NAMES},
         "condition_quantiles": quantiles(found["condition"][traced]),
         "levels": np.bincount(found["level"]).tolist(),
     }
@@ -53,6 +57,13 @@ def quantiles(values):
     """The quantiles of what is finite."""
     values = values[np.isfinite(values)]
     return [float(f"{q:.3g}") for q in np.quantile(values, QUANTILES)] if len(values) else [None] * len(QUANTILES)
+
+
+def shares(values):
+    """How many percent of what is finite and positive lies in each of `BINS`, by exponent."""
+    exponent = np.log10(np.maximum(values[np.isfinite(values) & (values > 0)], 10 ** BINS[0]))
+    counts, _ = np.histogram(exponent, BINS)
+    return np.round(100 * counts / max(len(exponent), 1), 4).tolist()
 
 
 def examples(found, most=20):
@@ -97,7 +108,7 @@ def report(double, single, seed, seconds, *, keep):
     print(f"{seconds:.0f} s")
     if keep:
         save("stability", result)
-        draw(double, single).savefig(RESULTS / "stability.svg")
+        draw(result).savefig(RESULTS / "stability.svg")
 
 
 def table(result):
@@ -114,7 +125,7 @@ def table(result):
             print("  " + f"{name:16}" + "".join(f"{v:10.1e}" for v in part["residual_quantiles"][name].values()))
 
 
-def draw(double, single):
+def draw(result):
     """Statuses as bars, residuals as histograms."""
     import matplotlib
 
@@ -122,14 +133,18 @@ def draw(double, single):
     import matplotlib.pyplot as plt
 
     plt.rcParams.update({"font.size": 8, "svg.fonttype": "none", "axes.spines.top": False, "axes.spines.right": False})
-    figure = plt.figure(figsize=(7.2, 4.6), constrained_layout=True)
-    grid = figure.add_gridspec(2, 4)
-    bars(figure.add_subplot(grid[:, 0]), double)
-    for k, (name, title) in enumerate(NAMES.items()):
-        axes = figure.add_subplot(grid[k // 3, 1 + k % 3])
-        histogram(axes, double[name], single[name], getattr(DOUBLE, limit_of(name)), title)
-        if k == 0:
-            axes.legend(frameon=False, loc="upper center", fontsize=7)
+    figure = plt.figure(figsize=(9.0, 4.6), constrained_layout=True)
+    left, right = figure.subfigures(1, 2, width_ratios=[1, 2.6])
+    bars(left.subplots(), result["float64"]["status"])
+    several = right.subplots(2, 3, sharex=True, sharey=True).ravel()
+    for axes, (name, title) in zip(several, NAMES.items(), strict=True):
+        percent = [result[p]["residual_percent_by_exponent"][name] for p in ("float64", "float32")]
+        histogram(axes, *percent, result["limits"]["float64"][limit_of(name)], title)
+    for axes in several[::3]:
+        axes.set_ylabel("scenes / %")
+    for axes in several[3:]:
+        axes.set_xlabel("relative residual")
+    right.legend(*several[0].get_legend_handles_labels(), frameon=False, loc="outside upper right", ncols=3)
     return figure
 
 
@@ -138,30 +153,28 @@ def limit_of(name):
     return {"closure": "closure", "tangent": "tables", "columns": "tables", "energy": "energy"}.get(name, "motion")
 
 
-def bars(axes, found):
+def bars(axes, status):
     """How often each status occurs."""
-    counts = np.bincount(found["status"], minlength=len(STATUSES))
-    order = np.argsort(counts)
-    order = order[counts[order] > 0]
-    axes.barh(range(len(order)), counts[order], color=BLUE)
-    for y, k in enumerate(order):
-        axes.text(counts[k], y, f" {counts[k]:,}", va="center", fontsize=7)
-    axes.set_yticks(range(len(order)), [STATUSES[k].replace("_", " ") for k in order])
-    axes.set_xlim(0, counts.max() * 1.35)
+    names = sorted(status, key=lambda name: status[name])
+    counts = [status[name] for name in names]
+    axes.barh(range(len(names)), counts, color=BLUE)
+    for y, count in enumerate(counts):
+        axes.text(count, y, f" {count:,}", va="center", fontsize=7)
+    axes.set_yticks(range(len(names)), [name.replace("_", " ") for name in names])
+    axes.set_xlim(0, max(counts) * 1.35)
     axes.set_xticks([])
     axes.spines["bottom"].set_visible(False)
-    axes.set_title(f"status of {counts.sum():,} scenes", fontsize=8, loc="left")
+    axes.set_title(f"status of {sum(counts):,} scenes (float64)", fontsize=8, loc="left")
 
 
 def histogram(axes, double, single, limit, title):
     """One residual in both precisions, as shares of the scenes."""
-    bins = np.arange(-18.0, 1.01, 0.5)
-    for values, colour, label in ((double, BLUE, "float64"), (single, ORANGE, "float32")):
-        exponent = np.log10(np.maximum(values[np.isfinite(values) & (values > 0)], 1e-18))
-        if len(exponent):
-            weights = np.full(len(exponent), 100 / len(exponent))
-            axes.hist(exponent, bins, weights=weights, color=colour, alpha=0.75, label=label)
-    axes.axvline(np.log10(limit), color=GREY, lw=0.8, ls="--")
-    axes.set_xticks([-16, -12, -8, -4, 0], [f"$10^{{{k}}}$" for k in (-16, -12, -8, -4, 0)])
-    axes.set_xlabel(f"{title}, relative")
-    axes.set_ylabel("scenes / %")
+    for percent, colour, label in ((double, BLUE, "float64"), (single, ORANGE, "float32")):
+        axes.stairs(percent, BINS, fill=True, color=colour, alpha=0.75, label=label)
+    axes.axvline(np.log10(limit), color=GREY, lw=0.8, ls="--", label="limit in float64")
+    axes.set_xticks([-16, -8, 0], [f"$10^{{{k}}}$" for k in (-16, -8, 0)])
+    axes.set_title(title, fontsize=8, loc="left")
+
+
+if __name__ == "__main__":
+    draw(json.loads((RESULTS / "stability.json").read_text())).savefig(RESULTS / "stability.svg")
