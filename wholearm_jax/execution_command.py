@@ -2,6 +2,8 @@
 
 import sys
 import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -70,7 +72,9 @@ def execute(
         print(f"{contact} {'made' if made else 'opened'}: {times} executed")
     many = None
     if perturb:
-        many = drive_perturbed(prediction, perturb, amounts, seed=seed, timestep=timestep, tolerance=within)
+        with _progress(perturb) as told:
+            settings = {"seed": seed, "timestep": timestep, "tolerance": within, "callback": told}
+            many = drive_perturbed(prediction, perturb, amounts, **settings)
         print(many.message)
     if folder is not None:
         _write_execution(done, many, torque, folder, video)
@@ -87,6 +91,29 @@ def _share(option: str, text: str) -> float:
     if not 0 <= share < 1:
         raise BadInput(f"{option} {text}: write a share between 0 and 1, e.g. 10% or 0.1")
     return share
+
+
+@contextmanager
+def _progress(count: int) -> Iterator[Callable]:
+    """A bar on the terminal while perturbed executions run, to be called with each that is done."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    from wholearm_jax.execution import Ending
+
+    columns = (
+        *(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}")),
+        *(TextColumn("{task.fields[succeed]} succeed"), TimeElapsedColumn(), TimeRemainingColumn()),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        bar, succeed = progress.add_task("perturbed executions", total=count, succeed=0), 0
+
+        def told(run) -> None:
+            nonlocal succeed
+            succeed += run.ending is Ending.OK
+            progress.update(bar, advance=1, succeed=succeed)
+
+        yield told
 
 
 def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> None:

@@ -11,7 +11,7 @@ torques stay those of the unperturbed plan, and so does the end that counts as s
 # pyright: reportAttributeAccessIssue=false
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -100,10 +100,12 @@ def perturb(
     softness: Softness = Softness(),
     tolerance: Tolerance = Tolerance(),
     workers: int | None = None,
+    callback: Callable[[Perturbed], None] | None = None,
 ) -> Robustness:
     """Execute `count` perturbed copies of a plan in `workers` processes (default: one for each processor).
 
-    Raises ValueError as `require_wires` and `require_objects` do, and for numbers that are not positive.
+    `callback` sees each as it is done, in their order. Raises ValueError as `require_wires` and `require_objects` do,
+    and for numbers that are not positive.
     """
     require_positive(count=count, timestep=timestep)
     require_wires(prediction)
@@ -124,6 +126,8 @@ def perturb(
     for scene, (end, creep) in zip(scenes, found, strict=True):
         ending, _ = judge(scene, end, target, tolerance, creep)
         runs.append(_summary(prediction.scene, scene, end, target, ending))
+        if callback is not None:
+            callback(runs[-1])
     return Robustness(amounts, seed, tolerance, tuple(runs))
 
 
@@ -172,10 +176,10 @@ def _touch_down(shape, hand, gravity, formation: Formation, z, shift) -> Float[A
 
 def roll_out(
     copies: Iterable[tuple[FreeBodies, Float[np.ndarray, "5"]]], torques, workers: int
-) -> list[tuple[Float[np.ndarray, "5"], float]]:
+) -> Iterator[tuple[Float[np.ndarray, "5"], float]]:
     """Where free bodies end, driven from rest at their starts, and how far contacts crept (`execution.follow`)."""
     each = (delayed(_end)(bodies, start, torques) for bodies, start in copies)
-    return list(Parallel(n_jobs=workers)(each))  # pyright: ignore[reportReturnType]
+    return Parallel(n_jobs=workers, return_as="generator")(each)  # pyright: ignore[reportReturnType]
 
 
 def _end(bodies: FreeBodies, start, torques) -> tuple[Float[np.ndarray, "5"], float]:
