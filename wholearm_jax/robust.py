@@ -8,6 +8,8 @@ quantile; the best schedule met on the way is kept, the nominal one among them.
 Driven open loop, samples with other friction cannot all arrive exactly. A sample *holds* when every contact stays in
 compression while each phase lasts and the phase ends within a share `arrival` of its wire's length of the end, at a
 speed that fits (`verdict`); the next phase then starts at rest at the end, as in every plan.
+
+Derivation: section 11 of `docs/derivation.md`.
 """
 
 from collections.abc import Callable
