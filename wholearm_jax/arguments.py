@@ -31,6 +31,16 @@ def scene_of(name: str, changes: list[str] | None):
     return scene
 
 
+def counting(told: str):
+    """A progress bar on the terminal that counts, with its task's field in the text `told` and the time left."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    counted = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}")
+    columns = *counted, TextColumn(told), TimeElapsedColumn(), TimeRemainingColumn()
+    return Progress(*columns, console=Console(stderr=True))
+
+
 def _changed(scene, change: str):
     import equinox as eqx
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import typer
 
-from wholearm_jax.arguments import TORQUE, BadInput, SceneName, note, note_limits, writing
+from wholearm_jax.arguments import TORQUE, BadInput, SceneName, counting, note, note_limits, writing
 from wholearm_jax.settings import configure
 
 BESIDE = (".json", ".png", ".svg", ".pdf")  # what stands beside a store, under its name
@@ -200,18 +200,11 @@ def _shared_store(out: Path, wanted, job: _Job, place: _Place):
 
 def _fill(store, job: _Job, place: _Place) -> None:
     """Compute and write the chunks that are missing and fall to this process."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
     done = store.done()
     missing = [k for k in range(place.number, store.chunks, place.count) if not done[k]]
     if not missing:
         return
-    columns = (
-        *(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}")),
-        *(TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TimeRemainingColumn()),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with counting("{task.fields[rate]}") as progress:
         total = sum(min(store.chunk, store.count - k * store.chunk) for k in missing)
         bar, begun, written = progress.add_task("scenes", total=total, rate="compiling"), None, 0
         for number, values in _optimised(job, missing) if job.optimise else _checked(job, missing):

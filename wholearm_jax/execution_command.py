@@ -13,6 +13,7 @@ from wholearm_jax.arguments import (
     BadInput,
     SceneName,
     TorqueFile,
+    counting,
     made_folder,
     predicted,
     scene_of,
@@ -96,16 +97,9 @@ def _share(option: str, text: str) -> float:
 @contextmanager
 def _progress(count: int) -> Iterator[Callable]:
     """A bar on the terminal while perturbed executions run, to be called with each that is done."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
     from wholearm_jax.execution import Ending
 
-    columns = (
-        *(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}")),
-        *(TextColumn("{task.fields[succeed]} succeed"), TimeElapsedColumn(), TimeRemainingColumn()),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with counting("{task.fields[succeed]} succeed") as progress:
         bar, succeed = progress.add_task("perturbed executions", total=count, succeed=0), 0
 
         def told(run) -> None:
