@@ -255,16 +255,17 @@ def test_a_dip_between_samples_is_found_among_many_low_steps(floor):
     assert floor > 0 or int(found.lost_contact) == 2
 
 
-def test_what_passes_and_comes_back_within_a_step_is_met_on_its_way_down():
-    """A vertex that grazes a finger: it dips through soon, and is back to rounding where the step ends."""
-    pairs = SimpleNamespace(lower=jnp.zeros(1), upper=jnp.ones(1))
+@pytest.mark.parametrize("side", [1, -1])
+def test_what_passes_and_comes_back_within_a_step_is_met_on_its_way_down(side):
+    """A vertex that grazes a finger, or its back: it dips through soon, and is back to rounding where the step ends."""
+    pairs = SimpleNamespace(lower=jnp.zeros(1), upper=jnp.ones(1), on_link=jnp.array([True]))
     watched = SimpleNamespace(candidates=pairs, watched=jnp.array([True]))
     step, inside = 2e-3, jnp.array([0.5])
     gap = np.polynomial.Polynomial.fromroots([0.3 * step, 0.999999 * step])
     steady = jnp.array([1.0])  # some room that nothing changes
 
     def at(s):
-        values, rates = jnp.array([gap(s)]), jnp.array([gap.deriv()(s)])
+        values, rates = jnp.array([side * gap(s)]), jnp.array([side * gap.deriv()(s)])
         return Watched(jnp.append(values, steady), jnp.append(rates, 0.0), inside)
 
     assert gap(step) > 0 > gap(0.5 * step)
@@ -294,6 +295,29 @@ def test_a_convex_object_is_not_held_by_a_finger_s_back():
     near = scene(upper + lower, contacts, "theta1+", start, joint=joints, length=1.86075, offset=offset)
     near = eqx.tree_at(lambda s: s.hand.joint, near, near.hand.joint.at[0, 1].set(-0.38341))
     assert int(wa.trace(near)[0].table.status) == wa.Status.LEFT_FORMATION
+
+
+def test_a_vertex_stops_at_the_back_of_a_finger():
+    """A fingertip lies in a polygon's notch, which turns until one of its sides comes down on the finger's back."""
+    lower = [[-0.1329, 0.0351], [-0.242, 0.0235], [-0.2817, 0.0035], [-0.1905, -0.0126], [-0.1286, -0.0474]]
+    upper = [[0.0768, -0.0378], [0.2606, -0.0203], [0.2611, 0.0124], [0.1257, 0.0325], [0.0003, 0.0468]]
+    contacts = ["palm:v2", "finger1:e3", "finger1:e2", "finger2:v7"]
+    start = [-0.05781, 0.24483, -4.17855, 2.78475, 0.97554]
+    notched = scene(lower + upper, contacts, "phi-", start, joint=(0.28353, -0.51556), length=1.51684)
+    notched = eqx.tree_at(lambda s: s.hand.length, notched, notched.hand.length.at[0].set(0.24942))
+    traced = wa.trace(notched)[0]
+    assert int(traced.table.status) == wa.Status.OK
+    assert ending(traced, notched.phases[0], 16) == "finger1:v4 is made"
+    side = np.subtract(lower[3], lower[4])  # from the rim to the bottom, where the tip is: along the finger at the end
+
+    def across(z):
+        """How far the rim is behind the finger: the sine of the angle between finger and side, times its length."""
+        way = z[..., 3] - z[..., 2]
+        return np.cos(way) * side[1] - np.sin(way) * side[0]
+
+    assert across(np.asarray(traced.end)) == pytest.approx(0, abs=1e-12)
+    used = np.asarray(traced.wire.owner) < int(traced.table.count)
+    assert np.all(across(np.asarray(traced.wire.nodes)[used]) > 0)
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,8 @@ r"""March: follow the curve `z(s)` of a formation in short steps until something
 Each step predicts the next node by the cubic through the last two and their tangents, and corrects it by Newton's
 method on the C-functions in the plane `u . z = s`, `u` being the chart's direction. What is watched on the way: gaps of
 contacts that might be made, room on the features of those that hold, a coordinate's limit (each ends the wire where it
-turns negative, or dips below zero and returns within a step), slips and joint speeds (each reversal is a kink), and the
-sign of `det [G; x]`, which changes where two wires meet.
+turns negative, or dips below zero and returns within a step; a vertex behind a link where its gap turns positive),
+slips and joint speeds (each reversal is a kink), and the sign of `det [G; x]`, which changes where two wires meet.
 
 Derivation: section 3 of `docs/derivation.md`.
 """
@@ -260,26 +260,30 @@ def crossings(system, before: Watched, after: Watched, step, tolerance):
     The share is a root of the cubic through values and rates: several things that end a wire within the shortest step
     are told apart to 1e-13.
     """
-    old, new = before.values, after.values
-    through = (old >= -tolerance) & (new < -tolerance)
-    slope = jnp.where(after.rates > before.rates, after.rates - before.rates, 1.0)
-    turns = (before.rates < 0) & (after.rates > 0) & (old > tolerance)
-    sinks = turns & (old - step * before.rates**2 / (2 * slope) < 0)
+    pairs = system.candidates.lower.shape[0]
+    # A vertex behind a link, within its length, stops at its back.
+    behind = (before.values[:pairs] < -tolerance) & system.candidates.on_link
+    sense = jnp.ones_like(before.values).at[:pairs].set(jnp.where(behind, -1.0, 1.0))
+    old, new, leaving, arriving = sense * before.values, sense * after.values, sense * before.rates, sense * after.rates
+    # From either side what is within the tolerance counts as in front.
+    through = (old >= -tolerance) & (new < -sense * tolerance)
+    slope = jnp.where(arriving > leaving, arriving - leaving, 1.0)
+    turns = (leaving < 0) & (arriving > 0) & (old > tolerance)
+    sinks = turns & (old - step * leaving**2 / (2 * slope) < 0)
     dips = sinks & (new > tolerance)
 
     def placed():
         """Most steps cross nothing: there all this is left out."""
         line = jnp.clip(old / jnp.where(through, old - new, 1.0), 0.0, 1.0)
-        bend = jnp.sqrt(jnp.where(sinks, before.rates**2 - 2 * old * slope / step, 0.0))
+        bend = jnp.sqrt(jnp.where(sinks, leaving**2 - 2 * old * slope / step, 0.0))
         # What comes back is met on its way down.
-        where = jnp.where(through & ~sinks, line, (-before.rates - bend) / slope)
-        low, high = step * before.rates, step * after.rates
+        where = jnp.where(through & ~sinks, line, (-leaving - bend) / slope)
+        low, high = step * leaving, step * arriving
         square, cube = 3 * (new - old) - 2 * low - high, low + high - 2 * (new - old)
         for _ in range(2):
             rate = low + where * (2 * square + 3 * where * cube)
             better = where - (old + where * (low + where * (square + where * cube))) / jnp.where(rate < 0, rate, -1.0)
             where = jnp.where((rate < 0) & (better >= 0) & (better <= 1), better, where)
-        pairs = system.candidates.lower.shape[0]
         at = before.along + (after.along - before.along) * where[:pairs]
         inside = (at >= system.candidates.lower - tolerance) & (at <= system.candidates.upper + tolerance)
         counts = jnp.concatenate([inside & system.watched, jnp.ones(new.shape[0] - pairs, bool)])
