@@ -258,8 +258,8 @@ def test_a_dip_between_samples_is_found_among_many_low_steps(floor):
 @pytest.mark.parametrize("side", [1, -1])
 def test_what_passes_and_comes_back_within_a_step_is_met_on_its_way_down(side):
     """A vertex that grazes a finger, or its back: it dips through soon, and is back to rounding where the step ends."""
-    pairs = SimpleNamespace(lower=jnp.zeros(1), upper=jnp.ones(1), on_link=jnp.array([True]))
-    watched = SimpleNamespace(candidates=pairs, watched=jnp.array([True]))
+    pairs = SimpleNamespace(lower=jnp.zeros(1), upper=jnp.ones(1))
+    watched = SimpleNamespace(candidates=pairs, watched=jnp.array([True]), behind=jnp.array([True]))
     step, inside = 2e-3, jnp.array([0.5])
     gap = np.polynomial.Polynomial.fromroots([0.3 * step, 0.999999 * step])
     steady = jnp.array([1.0])  # some room that nothing changes

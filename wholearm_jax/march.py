@@ -3,7 +3,7 @@ r"""March: follow the curve `z(s)` of a formation in short steps until something
 Each step predicts the next node by the cubic through the last two and their tangents, and corrects it by Newton's
 method on the C-functions in the plane `u . z = s`, `u` being the chart's direction. What is watched on the way: gaps of
 contacts that might be made, room on the features of those that hold, a coordinate's limit (each ends the wire where it
-turns negative, or dips below zero and returns within a step; a vertex behind a link where its gap turns positive),
+turns negative, or dips below zero and returns within a step; a vertex behind a finger where its gap turns positive),
 slips and joint speeds (each reversal is a kink), and the sign of `det [G; x]`, which changes where two wires meet.
 
 Derivation: section 3 of `docs/derivation.md`.
@@ -261,8 +261,8 @@ def crossings(system, before: Watched, after: Watched, step, tolerance):
     are told apart to 1e-13.
     """
     pairs = system.candidates.lower.shape[0]
-    # A vertex behind a link, within its length, stops at its back.
-    behind = (before.values[:pairs] < -tolerance) & system.candidates.on_link
+    # A vertex behind a link, within its length, stops at its back; one misplaced there comes out.
+    behind = (before.values[:pairs] < -tolerance) & system.behind
     sense = jnp.ones_like(before.values).at[:pairs].set(jnp.where(behind, -1.0, 1.0))
     old, new, leaving, arriving = sense * before.values, sense * after.values, sense * before.rates, sense * after.rates
     # From either side what is within the tolerance counts as in front.

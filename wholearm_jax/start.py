@@ -48,10 +48,7 @@ def misplaced(system, z):
     held, pairs = frames(system.contacts, z), frames(system.candidates, z)
     beyond = (held.along < system.contacts.lower - tolerance) | (held.along > system.contacts.upper + tolerance)
     inside = (pairs.along > system.candidates.lower) & (pairs.along < system.candidates.upper)
-    behind = system.watched & system.candidates.on_link & inside & (pairs.gap < -tolerance)
-    for of_finger, held_by in zip(system.candidates.finger, system.contacts.finger, strict=True):
-        holds = jnp.any((held_by > 0) & system.contacts.on_link)
-        behind &= (of_finger == 0) | (system.convex & holds)  # an object may lie beyond the line of any other finger
+    behind = system.watched & system.candidates.on_link & ~system.behind & inside & (pairs.gap < -tolerance)
     return jnp.any(beyond) | jnp.any(behind) | _pierced(system, pairs, tolerance)
 
 

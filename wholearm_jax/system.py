@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from wholearm_jax.contacts import Contacts, contacts, every_meeting
-from wholearm_jax.scene import EDGE, Body, Formation, Hand, next_vertex
+from wholearm_jax.scene import EDGE, VERTEX, Body, Formation, Hand, next_vertex
 
 
 class System(eqx.Module):
@@ -20,7 +20,7 @@ class System(eqx.Module):
 
     `inertia` is the diagonal of `M = diag(m, m, I, J1, J2)`; `viscous` and `dry` are B and D; `gravity` is an
     acceleration. `candidates` are all pairs that may touch, `real` those of features that the object has; `watched`
-    marks those that could end the formation.
+    marks those that could end the formation, `behind` vertices that may lie behind a link, whose back stops them.
     `length` [m] and `mass` [kg] are the units; `torque_limit` stays in N m.
     """
 
@@ -28,6 +28,7 @@ class System(eqx.Module):
     candidates: Contacts
     real: Bool[Array, "candidates"]
     watched: Bool[Array, "candidates"]
+    behind: Bool[Array, "candidates"]
     inertia: Float[Array, "5"]
     viscous: Float[Array, "2"]
     dry: Float[Array, "2"]
@@ -35,7 +36,6 @@ class System(eqx.Module):
     length: Float[Array, ""]
     mass: Float[Array, ""]
     torque_limit: Float[Array, "2"]
-    convex: Bool[Array, ""]
 
     @property
     def configuration_unit(self) -> Float[Array, "5"]:
@@ -82,6 +82,7 @@ def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Format
         candidates=contacts(small_body, small_hand, pairs),
         real=touchable,
         watched=touchable & ~_coincident(pairs, formation, body.count),
+        behind=_behind(pairs, formation, _convex(body)),
         inertia=jnp.concatenate([heavy, small_hand.inertia]),
         viscous=small_hand.viscous,
         dry=small_hand.dry,
@@ -89,7 +90,6 @@ def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Format
         length=length,
         mass=mass,
         torque_limit=hand.torque_limit,
-        convex=_convex(body),
     )
 
 
@@ -99,6 +99,15 @@ def _convex(body: Body) -> Bool[Array, ""]:
     edge = body.vertices[following] - body.vertices
     turn = edge[:, 0] * edge[following, 1] - edge[:, 1] * edge[following, 0]
     return jnp.all((turn >= 0) | (jnp.arange(turn.shape[0]) >= body.count))
+
+
+def _behind(pairs: Formation, formation: Formation, convex) -> Bool[Array, "candidates"]:
+    """Vertices against links that they may lie behind: any finger but one that vertices of a convex object slide on."""
+
+    def holds(link):
+        return jnp.any((formation.link == link) & (formation.kind == VERTEX))
+
+    return (pairs.kind == VERTEX) & (pairs.link > 0) & ~(convex & jax.vmap(holds)(pairs.link))
 
 
 def _coincident(pairs: Formation, formation: Formation, count) -> Bool[Array, "candidates"]:
