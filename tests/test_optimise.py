@@ -11,6 +11,7 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.descent import COLDEST, JOINED
+from wholearm_jax.pacing import CONVERGED
 from wholearm_jax.plan import simulate
 from wholearm_jax.scene_file import to_dict
 from wholearm_jax.verdict import ARRIVAL
@@ -54,6 +55,22 @@ def test_history_says_what_happened(optimised):
         assert [step.step for step in steps if step.start == 0] == list(range(sum(s.start == 0 for s in steps)))
         ends = [step for step in steps if step.apart < JOINED and step.temperature <= COLDEST]
         assert phase.margin == pytest.approx(max(step.margin for step in ends), rel=3e-3), "samples of joined intervals"
+
+
+def test_a_start_that_leads_to_a_known_end_is_not_followed_to_it():
+    """At this pace both phases stay below 99 % of their bounds, and a second start says whether that is all."""
+    scene = wa.load("heptagon")
+    for k in range(2):
+        scene = eqx.tree_at(lambda s, k=k: s.phases[k].duration, scene, jnp.asarray(0.15))
+    found = wa.optimise(scene)
+    assert found.result.status is wa.Status.OK
+    for row, share in enumerate(found.reached):
+        assert share < 0.99
+        assert found.stopped[row] == CONVERGED
+        last = {step.start: step for step in found.history if step.phase == row}
+        assert sorted(last) == [0, 1]
+        assert last[0].apart < JOINED < last[1].apart < 1e-2
+        assert last[1].margin == pytest.approx(last[0].margin, rel=0.05)
 
 
 def test_phases_side_by_side_are_what_each_is_alone(optimised):

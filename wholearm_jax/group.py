@@ -20,7 +20,7 @@ from wholearm_jax.descent import interior_point, projected
 from wholearm_jax.guesses import guesses
 from wholearm_jax.handover import Handover
 from wholearm_jax.linearisation import Limits
-from wholearm_jax.pacing import Problem, Step, descend
+from wholearm_jax.pacing import CONVERGED, REPEATED, Problem, Step, descend
 from wholearm_jax.phase import Traced, run
 from wholearm_jax.plan import stacked
 from wholearm_jax.precision import array
@@ -127,8 +127,11 @@ def optimise_group(scene: Scene, group: Group) -> tuple[list[Torque], str, list[
     for number, start in enumerate(begins):
         for at, torque in group.pins.items():
             start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[at].set(torque))
-        p, why, taken = descend(problem, start, number, method, wanted.callback)
+        ended = [other for fine, _, why, other in found if fine and why == CONVERGED]
+        p, why, taken = descend(problem, start, number, method, wanted.callback, ended)
         history += taken
+        if why == REPEATED:
+            break
         fine, share = _honest(scene, group, p)
         best = max((other for ok, other, *_ in found if ok), default=np.nan)
         agree = fine and abs(share - best) <= tolerance

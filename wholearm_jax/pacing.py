@@ -3,10 +3,11 @@
 Full steps of the interior point (`descent`) lead on fastest, but may go round in a circle for ever: where knots pass
 kinks of the wire to and fro, and along ways that the loss hardly sees. Who circles is held back, more and more. Once
 the margin has settled, steps only join the intervals: that converges quadratically, as the interior point does not.
+A descent is given up where it comes to where an earlier start led.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -25,6 +26,8 @@ CLOSE = 1e-5  # sum of the defects from which full steps close them
 SETTLED, NEARLY = 0.05, 1e-2  # shares of the tolerance by which a margin that settled changes, sum of its defects
 CLOSING = 1e3  # price of a step's size beside which the margin counts little: the smallest step that joins intervals
 LOST = 1e-6  # share of a step at which a descent gives up
+ALIKE = (2e-3, 2e-2)  # differences of states at knots [lengths, lengths a duration] with which descents end alike
+CONVERGED, REPEATED = "the margin no longer improves", "an earlier start led there, too"
 HOW = Integration()
 
 
@@ -55,11 +58,17 @@ class Problem(NamedTuple):
 
 
 def descend(
-    problem: Problem, start: Variables, number: int, method, callback: Callable[[Step], None] | None
+    problem: Problem,
+    start: Variables,
+    number: int,
+    method,
+    callback: Callable[[Step], None] | None,
+    ended: Sequence[Variables] = (),
 ) -> tuple[Variables, str, list[Step]]:
     """Descend from start number `number`: the variables where it ends, why it ends, and its steps.
 
-    `method` is `descent.interior_point` or `descent.projected`.
+    `method` is `descent.interior_point` or `descent.projected`; `ended` is where descents from earlier starts
+    ended, of which none is followed to its end again.
     """
     d, rounds, margin_before, history = begin(start, method), 0, np.nan, []
     for count in range(problem.steps):
@@ -74,14 +83,23 @@ def descend(
         if callback is not None:
             callback(history[-1])
         if apart < JOINED and hot <= coldest and (shares.min() >= 1 or near):
-            return d.p, "the margin no longer improves", history
+            return d.p, CONVERGED, history
         if share < LOST:
             return d.p, "no step leads on", history
+        if apart < NEARLY and any(_alike(d.p, other) for other in ended):
+            return d.p, REPEATED, history
         settled = hot <= coldest and apart < NEARLY and _settled(problem, least.min(), margin - margin_before)
         circling = not settled and count >= problem.steps // 3 and apart > CLOSE
         rounds, margin_before = rounds + circling, margin
         d = after._replace(**(_JOINING if settled else _held_back(rounds) if circling else _FULL))
     return d.p, f"the limit of {problem.steps} steps", history
+
+
+def _alike(p: Variables, other: Variables) -> bool:
+    """Whether descents come to one end: states at all knots and durations differ little."""
+    states = np.abs(np.asarray(p.state) - np.asarray(other.state)).max((0, 1))
+    lasting = np.abs(np.asarray(p.log_duration) - np.asarray(other.log_duration)).max()
+    return bool(np.all(states < ALIKE) and lasting < ALIKE[0])
 
 
 def _settled(problem: Problem, least, change) -> bool:
