@@ -33,12 +33,26 @@ def scene_of(name: str, changes: list[str] | None):
 
 def counting(told: str):
     """A progress bar on the terminal that counts, with its task's field in the text `told` and the time left."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    counted = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}")
-    columns = *counted, TextColumn(told), TimeElapsedColumn(), TimeRemainingColumn()
-    return Progress(*columns, console=Console(stderr=True))
+    return _progress(
+        TextColumn("{task.completed}/{task.total}"), TextColumn(told), TimeElapsedColumn(), TimeRemainingColumn()
+    )
+
+
+def descending():
+    """A progress bar on the terminal for each descent, with its task's field `state`: the time left is not known."""
+    from rich.progress import TextColumn, TimeElapsedColumn
+
+    return _progress(TextColumn("{task.fields[state]}"), TimeElapsedColumn())
+
+
+def _progress(*columns):
+    """Progress bars, each named, with columns behind them."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    return Progress(TextColumn("{task.description}"), BarColumn(), *columns, console=Console(stderr=True))
 
 
 def _changed(scene, change: str):

@@ -17,6 +17,7 @@ from wholearm_jax.arguments import (
     BadInput,
     SceneName,
     TorqueFile,
+    descending,
     made_folder,
     phase_number,
     predicted,
@@ -125,17 +126,13 @@ def optimise(
             raise BadInput(f"--robust: knows no --{unknown[0]}")
         optimise_robustly(ensemble(loaded, robust, seed), folder, samples or 64, knots, steps, arrival, report)
     samples = samples or 201
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
     from wholearm_jax.optimiser import PASSING, optimise_beside
     from wholearm_jax.optimiser import optimise as find
 
     begun = time.perf_counter()
     optimise_beside(loaded, knots=knots)
     traced = traced_or_refused(scene, loaded)
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with descending() as progress:
         bars = [progress.add_task(p.name, total=steps, state="waiting") for p in loaded.phases]
 
         def show(step):

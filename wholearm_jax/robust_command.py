@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from wholearm_jax.arguments import BadInput
+from wholearm_jax.arguments import BadInput, descending
 from wholearm_jax.finishing import write_result
 
 
@@ -11,9 +11,6 @@ def optimise_robustly(
     varied, folder: Path | None, samples: int, knots: int, steps: int, arrival: float, report: bool
 ) -> None:
     """Find the torques, say how they do on seen and unseen scenes, write what becomes of the nominal one, and exit."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
     from wholearm_jax.optimiser import bounds
     from wholearm_jax.plan import require_motion, simulate
     from wholearm_jax.robust import optimise_robustly as find
@@ -22,8 +19,7 @@ def optimise_robustly(
         require_motion(varied.scene)
     except ValueError as error:
         raise BadInput(f"--robust: {error}") from None
-    columns = (TextColumn("robust"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with descending() as progress:
         bar = progress.add_task("robust", total=steps + 1, state="the nominal schedule")
 
         def show(step, held):
