@@ -31,7 +31,7 @@ ORDER = (
     *("march", "start", "places", "wire", "reduction"),
     *("schedule", "stepping", "landing", "motion", "forces", "verdict", "holding"),
     *("phase", "result", "resting", "sampling", "plan", "gradient", "gradient_check"),
-    *("squeeze", "shooting", "linearisation", "condensing", "descent", "pacing"),
+    *("squeeze", "shooting", "linearisation", "recursion", "descent", "pacing"),
     *("formations", "guesses", "handover", "group", "optimiser", "baseline"),
     *("variation", "batch", "robust", "proportion", "survey"),
     *("free_bodies", "coulomb", "execution", "perturbation"),

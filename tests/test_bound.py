@@ -66,6 +66,17 @@ def test_the_bound_is_the_least_of_the_best_forces(phase, duration, rests, limit
         assert best_at(table, duration, float(place), rests)[1] >= value - 1e-9
 
 
+@pytest.mark.parametrize(("name", "grip"), [("heptagon", 1.0), ("tipping", 0.2)])
+def test_bounds_leave_out_only_what_cannot_roll(name, grip):
+    """At a fifth of its friction the tipping polygon is as good as slipping on either side."""
+    scene = wa.load(name)
+    scene = eqx.tree_at(lambda s: s.object.friction, scene, grip * scene.object.friction)
+    traced = wa.trace(scene)
+    for at, phase, top in zip(traced, scene.phases, wa.bounds(scene, traced=traced), strict=True):
+        every = bound(at.table, phase.duration, True, phase.arrive == "rest")
+        assert float(top.value) == pytest.approx(float(every.value), rel=1e-12)
+
+
 @pytest.mark.parametrize("acceleration", [-3.0, 0.0, 20.0, 300.0])
 @pytest.mark.parametrize("idle", [False, True], ids=["both fingers drive", "the second only presses"])
 @pytest.mark.parametrize("limits", [(1.0, 1.0), (0.4, 1.5)])

@@ -30,10 +30,10 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.condensing import following, free, newton_step, of_states, order, together
 from wholearm_jax.forces import smooth_margin
-from wholearm_jax.linearisation import Limits, Linear, change_of_rooms, gather, linearise, rooms_of, sizes
+from wholearm_jax.linearisation import Limits, Linear, change_of_rooms, gather, linearise, of_states, rooms_of
 from wholearm_jax.programs import Program
+from wholearm_jax.recursion import nearest, newton_step
 from wholearm_jax.reduction import Table
 from wholearm_jax.shooting import Variables
 from wholearm_jax.squeeze import acceleration_terms
@@ -127,7 +127,7 @@ def _reach(value, change):
 
 def _cap(linear: Linear, way):
     """The share of a step that keeps the states' changes within `LONGEST`."""
-    change = jnp.abs(of_states(linear, way).reshape(-1, 2)).max(0)
+    change = jnp.abs(way[of_states(linear)].reshape(-1, 2)).max(0)
     return (jnp.array(LONGEST) / jnp.maximum(change, 1e-30)).min()
 
 
@@ -144,8 +144,8 @@ class Cooling(NamedTuple):
 
 
 def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) -> optax.GradientTransformationExtraArgs:
-    """Any optax optimiser on torques and duration: the states follow so that the intervals join, and its updates are
-    projected onto those that arrive. The temperature falls by `cooling` a step."""
+    """Any optax optimiser on torques and duration: its updates are projected onto those with which the intervals join
+    and phases arrive. The temperature falls by `cooling` a step."""
     optimiser = optax.with_extra_args_support(optimiser)
 
     def init(params):
@@ -158,17 +158,10 @@ def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) ->
         above = at.room - linear.bears * level
         # Outside a limit the loss is infinite: there the pull back to it is that of a small room.
         pull = gather(linear, hot * linear.weight / jnp.maximum(above, hot))
-        goals, follow = order(*sizes(linear)).goals, following(linear)
-        last = follow.matrix[goals]
-
-        def arriving(step, rest):
-            return step - last.T @ jnp.linalg.solve(last @ last.T, last @ step + rest)
-
-        gradient = arriving(-free(linear, pull) - of_states(linear, pull) @ follow.matrix, 0.0)
-        whole = together(linear, gradient, jnp.zeros_like(follow.apart))
-        updates, inner = optimiser.update(whole, state.inner, params, **extra)
-        step = arriving(free(linear, jnp.where(linear.still, 0.0, jnp.asarray(updates))), follow.apart[goals])
-        way = together(linear, step, follow.matrix @ step + follow.apart)
+        joined = linear._replace(defect=jnp.zeros_like(linear.defect))
+        gradient = nearest(joined, -pull).at[of_states(linear)].set(0.0)
+        updates, inner = optimiser.update(gradient, state.inner, params, **extra)
+        way = nearest(linear, jnp.asarray(updates).at[of_states(linear)].set(0.0))
         change = change_of_rooms(linear, way)
         within = (linear.weight > 0) & (linear.bears == 0) & (at.room > 0)
         reach = _reach(jnp.where(within, at.room, 1.0), jnp.where(within, change, 0.0))

@@ -118,17 +118,20 @@ def slack(table: Table, forces: Float[Array, "slots"]) -> Float[Array, "slots"]:
     return jnp.where(table.tangential, cone, forces)
 
 
-def linear_slacks(table: Table, forces: Float[Array, "slots *terms"]) -> Float[Array, "rows *terms"]:
+def linear_slacks(
+    table: Table, forces: Float[Array, "slots *terms"], rolling: int = MOST_ROLLING
+) -> Float[Array, "rows *terms"]:
     """Linear functions of the forces whose least is the least `slack`: both sides of each friction cone.
 
     `forces` may be coefficients, by any linear terms. Four constraints have at most two tangential rows, and so there
-    are six of these; those not needed (`spare`) repeat the first.
+    are six of these, fewer where it is known that no more than `rolling` roll; those not needed (`spare`) repeat the
+    first.
     """
     column = (slice(None), *(None,) * (forces.ndim - 1))
     normal = table.grip[column] * jnp.roll(forces, 1, axis=0)
     one_side = jnp.where(table.tangential[column], normal - forces, forces)
-    (rolling,) = jnp.nonzero(table.tangential, size=MOST_ROLLING, fill_value=-1)
-    other = jnp.where((rolling >= 0)[column], (normal + forces)[rolling], forces[0])
+    (rows,) = jnp.nonzero(table.tangential, size=rolling, fill_value=-1)
+    other = jnp.where((rows >= 0)[column], (normal + forces)[rows], forces[0])
     return jnp.concatenate([one_side, other])
 
 

@@ -189,6 +189,12 @@ def sizes(linear: Linear) -> tuple[int, int]:
     return phases, intervals + 1
 
 
+def of_states(linear: Linear) -> slice:
+    """Where the states stand in the flattened `Variables`."""
+    phases, knots = sizes(linear)
+    return slice(2 * phases * knots, 4 * phases * knots)
+
+
 def columns(linear: Linear) -> Int[np.ndarray, "phases intervals 7"]:
     """Where in the flattened `Variables` each interval's seven numbers stand."""
     return _columns(*sizes(linear))[0]

@@ -32,7 +32,7 @@ from wholearm_jax.programs import Beside, Program, beside, wait
 from wholearm_jax.reduction import blank
 from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.result import Result, describe
-from wholearm_jax.scene import Scene, replace_duration
+from wholearm_jax.scene import Phase, Scene, replace_duration
 from wholearm_jax.schedule import Torque, evenly, in_turn, rounded
 from wholearm_jax.shooting import Variables, further
 from wholearm_jax.squeeze import Bound, bound
@@ -107,7 +107,8 @@ def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...
         if int(at.table.status) != Status.OK:
             return Bound(jnp.asarray(-np.inf), at.table.breaks[0], jnp.zeros(()))
         if phase.arrive != "hold":
-            return _bound(at.table, phase.duration, array(begin), array(phase.arrive == "rest"))
+            told = array(begin), array(phase.arrive == "rest"), _rolling(phase)
+            return _bound(at.table, phase.duration, *told)
         balance, departure = balance_at_start(scene, phase, at)
         return Bound(jnp.asarray(balance.best(departure).margin), at.table.breaks[0], jnp.zeros(()))
 
@@ -235,7 +236,8 @@ def optimise_beside(
 ) -> tuple[Beside, ...]:
     """Compile what `optimise` runs in a thread of its own, while wires are traced; it is to be waited for."""
     sizes = sorted({len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"})
-    squeezes = beside(_squeeze_blank, tuple(sizes), knots)
+    rolling = sorted({_rolling(p) for p in scene.phases if p.arrive != "hold"})
+    squeezes = beside(_squeeze_blank, tuple(sizes), tuple(rolling), knots)
     descents = [beside(_advance_blank, n, knots, optimiser) for n in sizes]
     return squeezes, *descents, beside(run_blank, _rows(scene, knots), with_room(Integration(), knots))
 
@@ -254,10 +256,16 @@ def _groups(scene: Scene) -> list[list[int]]:
     return groups
 
 
-def _squeeze_blank(sizes: tuple[int, ...], knots: int) -> None:
+def _rolling(phase: Phase) -> int:
+    """How many contacts of a phase roll."""
+    return int(np.asarray(phase.formation.tangential).sum())
+
+
+def _squeeze_blank(sizes: tuple[int, ...], rolling: tuple[int, ...], knots: int) -> None:
     """Make the bounds and starts of groups of such sizes on tables that have no wire."""
     table, one = blank(Resolution()), array(1.0)
-    _bound(table, one, array(True), array(True))
+    for count in rolling:
+        _bound(table, one, array(True), array(True), count)
     for phases in sizes:
         guesses([table] * phases, np.ones(phases), knots, TORQUE_SHARE)
 

@@ -1,4 +1,4 @@
-"""The condensed Newton step solves the whole system: every equation is written out here, densely, and looked at."""
+"""The recursion solves the whole system: every equation is written out here, densely, and looked at."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.condensing import SPREAD, following, newton_step
 from wholearm_jax.group import stacked_tables
 from wholearm_jax.linearisation import Limits, linearise
 from wholearm_jax.plan import trace
 from wholearm_jax.precision import array
+from wholearm_jax.recursion import SPREAD, nearest, newton_step
 from wholearm_jax.shooting import Variables
 from wholearm_jax.stepping import Integration
 
@@ -48,7 +48,7 @@ def _dense(linear):
 @pytest.mark.parametrize(
     ("name", "count", "free"), [("heptagon", 1, False), ("heptagon", 1, True), ("flight", 3, True)]
 )
-def test_a_condensed_step_solves_every_equation(name, count, free):
+def test_a_newton_step_solves_every_equation(name, count, free):
     linear, rng = _problem(name, count, free=free)
     assert np.all(np.isfinite(linear.at.room)), "the problem must be one that can be simulated"
     live = np.asarray(linear.weight) > 0
@@ -66,11 +66,31 @@ def test_a_condensed_step_solves_every_equation(name, count, free):
     assert np.abs(way[-count:]).max() > 0 or not free
 
 
-def test_states_follow_torques_as_the_linearised_intervals_say():
+@pytest.mark.parametrize(("name", "count"), [("heptagon", 1), ("flight", 3)])
+def test_the_nearest_step_joins_and_what_it_leaves_is_normal_to_all_that_do(name, count):
+    linear, rng = _problem(name, count, free=True)
+    across, moves = _dense(linear)[1], ~np.asarray(linear.still)
+    free = np.ones(moves.size, bool)
+    free[2 * count * KNOTS : 4 * count * KNOTS] = False
+    wanted = np.where(free, rng.normal(size=moves.size), 0.0)
+    way = np.asarray(eqx.filter_jit(nearest)(linear, wanted))
+    np.testing.assert_allclose(across @ way, -linear.defect, atol=1e-9 * np.abs(linear.defect).max())
+    left = np.where(free & moves, way - wanted, 0.0)
+    _, values, right = np.linalg.svd(across[:, moves])
+    along = right[(values > 1e-9 * values[0]).sum() :]  # ways that stay joined
+    np.testing.assert_allclose(along @ left[moves], 0.0, atol=1e-9 * np.linalg.norm(left))
+    assert np.linalg.norm(left) > 0.01
+
+
+def test_what_pulls_at_states_pulls_at_the_torques_that_they_follow():
     linear, rng = _problem("flight", 3, free=True)
-    follow, size = following(linear), 2 * 3 * KNOTS
-    u = np.where(np.delete(np.asarray(linear.still), np.s_[size : 2 * size]), 0.0, rng.normal(size=size + 3))
-    states = follow.matrix @ u + follow.apart
-    way = jnp.concatenate([u[:size], states, u[size:]])
-    joins = slice(0, 2 * 3 * (KNOTS - 1) + 2)
-    np.testing.assert_allclose((linear.across @ way + linear.defect)[joins], 0.0, atol=1e-9)
+    across, moves = _dense(linear)[1], ~np.asarray(linear.still)
+    joined = linear._replace(defect=jnp.zeros_like(linear.defect))
+    pull = rng.normal(size=moves.size)
+    way = np.asarray(eqx.filter_jit(nearest)(joined, pull))
+    free = np.ones(moves.size)
+    free[2 * 3 * KNOTS : 4 * 3 * KNOTS] = 0.0
+    _, values, right = np.linalg.svd(across[:, moves])
+    along = right[(values > 1e-9 * values[0]).sum() :]
+    left = free * way - pull  # the gradient of |torques and durations|^2 / 2 - pull.p
+    np.testing.assert_allclose(along @ left[moves], 0.0, atol=1e-9 * np.linalg.norm(left))
