@@ -39,21 +39,21 @@ class Quadratic(NamedTuple):
 
 
 class _Order(NamedTuple):
-    """The numbers of a stage: state and torques at its knot, the shared numbers (the level, then `durations`, `goals`
-    and `one`), torques at the next knot from `size` on.
+    """The numbers of a stage: state and torques at its knot, the shared numbers (`level`, `durations`, `goals` and
+    `one`), torques at the next knot from `size` on.
 
     `local` says which of an interval's seven numbers each is (7: none), `own` which variable of `p` counts in this
     stage and no other (the last: none). `ends` marks the goals of places and speeds in the stages that meet them, `v`
     are the last speeds of phases that hand over, `lost` and `steps` their equations.
     """
 
-    size: int
+    level: int
     durations: slice
-    goals: slice
     one: int
-    local: Int[np.ndarray, "phases 1 numbers"]
+    size: int
+    local: Int[np.ndarray, "phases numbers"]
     own: Int[np.ndarray, "phases intervals numbers"]
-    ends: Float[np.ndarray, "2 phases intervals goals"]
+    ends: Float[np.ndarray, "phases intervals 2 goals"]
     v: Int[np.ndarray, "seams"]
     lost: Int[np.ndarray, "seams"]
     steps: slice
@@ -63,26 +63,26 @@ class _Order(NamedTuple):
 def _order(phases: int, knots: int) -> _Order:
     """The same for all problems of a size."""
     intervals, each = knots - 1, np.arange(phases)
-    durations, goals = slice(5, 5 + phases), slice(5 + phases, 6 + 2 * phases)
-    one, size = goals.stop, goals.stop + 1
+    level, durations, one = 4, slice(5, 5 + phases), 6 + 2 * phases
+    size = one + 1
     after = np.arange(size, size + 2)
-    local = np.full((phases, 1, size + 2), 7)
-    local[:, :, :4], local[:, :, after], local[each, 0, 5 + each] = np.arange(4), [4, 5], 6
+    local = np.full((phases, size + 2), 7)
+    local[:, :4], local[:, after], local[each, 5 + each] = np.arange(4), [4, 5], 6
     knot = np.arange(2 * phases * knots).reshape(phases, knots, 2)
     count = 2 * knot.size + phases
     own = np.full((phases, intervals, size + 2), count)
     own[:, :, :2], own[:, :, 2:4] = knot.size + knot[:, :-1], knot[:, :-1]
     own[:, -1, after], own[each, -1, 5 + each] = knot[:, -1], 2 * knot.size + each
-    ends = np.zeros((2, phases, intervals, phases + 1))
-    ends[0, each, -1, each] = ends[1, -1, -1, -1] = 1.0
+    ends = np.zeros((phases, intervals, 2, phases + 1))
+    ends[each, -1, 0, each] = ends[-1, -1, 1, -1] = 1.0
     joins = phases * intervals * 2
     v, lost = knot.size + knot[:-1, -1, 1], joins + np.arange(phases - 1)
-    return _Order(size, durations, goals, one, local, own, ends, v, lost, slice(joins + phases - 1, None))
+    return _Order(level, durations, one, size, local, own, ends, v, lost, slice(joins + phases - 1, None))
 
 
 class _Stages(NamedTuple):
-    """What each stage costs, half of its second derivatives and half of what mirrors them, and how it leads to the
-    state and the torques of the next; `ends` are the rows of the state before it is handed over."""
+    """Second derivatives of what each stage costs, and how it leads to the state and the torques at the next knot;
+    `ends` are the rows of a state before it is handed over, or must be what it is planned to be."""
 
     cost: Float[Array, "phases intervals numbers numbers"]
     onward: Float[Array, "phases intervals 4 numbers"]
@@ -102,9 +102,8 @@ def newton_step(linear: Linear, stiff, aim, damping) -> tuple[Float[Array, "p"],
     lean = stiff * bears
     price = jnp.full(linear.still.shape, SPREAD) + damping
     rise = 1 - (bears * aim).sum()
-    return least(
-        linear, Quadratic(blocks(linear, stiff), price, gather(linear, aim), gather(linear, lean), lean.sum(), rise)
-    )
+    pulls = gather(linear, aim), gather(linear, lean)
+    return least(linear, Quadratic(blocks(linear, stiff), price, *pulls, lean.sum(), rise))
 
 
 def nearest(linear: Linear, wanted: Float[Array, "p"]) -> Float[Array, "p"]:
@@ -119,112 +118,131 @@ def nearest(linear: Linear, wanted: Float[Array, "p"]) -> Float[Array, "p"]:
 def least(linear: Linear, quadratic: Quadratic) -> tuple[Float[Array, "p"], Float[Array, ""], Float[Array, "e"]]:
     """Where a quadratic function is least under `E p = -defect`: `p`, the level, and the prices of the equations."""
     at, stages = _order(*sizes(linear)), _stages(linear, quadratic)
-    size, one = at.size, at.one
-    final = jnp.zeros((size, size)).at[4, 4].set(quadratic.weight)
-    final = final.at[4, one].set(-quadratic.rise).at[one, 4].set(-quadratic.rise)
-    shared = np.eye(size, size + 2)[4:]
+    value, gain, rate = _back(at, stages, quadratic)
+    # At the first knot the state is given, the torques are not.
+    free = slice(2, at.one)
+    torque, shared = jnp.split(jnp.linalg.solve(value[free, free], -value[free, at.one]), [2])
+    shared = jnp.append(shared, 1.0)
+    here, there = _forth(at, stages, gain, torque, shared)
+    chosen = -jnp.einsum("kij,kj->ki", gain, here)
+    numbers = jnp.concatenate([here, chosen], axis=1).reshape(stages.cost.shape[:3])
+    rates = jnp.einsum("kij,kj->ki", rate, there).reshape(*numbers.shape[:2], 4)
+    last = jnp.einsum("pij,pj->pi", stages.ends[:, -1], numbers[:, -1])
+    return _together(linear, numbers, last, shared), shared[0], _prices(linear, quadratic, rates, last, shared)
+
+
+def _back(at: _Order, stages: _Stages, quadratic: Quadratic):
+    """From the last knot to the first: second derivatives of `V` at the first; for each stage, how the torques at the
+    next knot follow (`-gain`), and the first four rows of the second derivatives of `V` there."""
+    size, level, one = at.size, at.level, at.one
+    final = jnp.zeros((size, size)).at[level, level].set(quadratic.weight)
+    final = final.at[level, one].set(-quadratic.rise).at[one, level].set(-quadratic.rise)
+    kept = np.eye(size, size + 2)[level:]
 
     def back(value, stage):
         cost, onward = stage
-        onward = jnp.concatenate([onward, shared])
+        onward = jnp.concatenate([onward, kept])
         whole = onward.T @ (value @ onward) + cost
         (a, b), (_, c) = whole[size:, size:]
         first, second = whole[size:, :size]
-        det = a * c - b * b
-        gain = jnp.stack([c * first - b * second, a * second - b * first]) / det
-        return whole[:size, :size] - first[:, None] * gain[0] - second[:, None] * gain[1], (gain, value[:4])
+        gain = jnp.stack([c * first - b * second, a * second - b * first]) / (a * c - b * b)
+        return whole[:size, :size] - first[:, None] * gain[0] - second[:, None] * gain[1], (gain, value[:level])
 
-    each = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), (stages.cost, stages.onward))
-    value, (gain, rate) = jax.lax.scan(back, final, each, reverse=True)
-    # At the first knot the state is given, the torques are not.
-    torque, rest = jnp.split(jnp.linalg.solve(value[2:one, 2:one], -value[2:one, one]), [2])
-    rest = jnp.append(rest, 1.0)
+    value, (gain, rate) = jax.lax.scan(back, final, (_in_turn(stages.cost), _in_turn(stages.onward)), reverse=True)
+    return value, gain, rate
 
-    led = each[1][:, :, :size] - each[1][:, :, size:] @ gain
-    steady = led[:, :, 4:] @ rest
+
+def _forth(at: _Order, stages: _Stages, gain, torque, shared):
+    """From the first knot to the last: all numbers of each stage but the torques at its next knot, and of the next."""
+    onward = _in_turn(stages.onward)
+    led = onward[:, :, : at.size] - onward[:, :, at.size :] @ gain
+    steady = led[:, :, at.level :] @ shared
     begin = jnp.concatenate([jnp.zeros(2), torque])
-    end, knot = jax.lax.scan(lambda x, stage: (stage[0] @ x + stage[1], x), begin, (led[:, :, :4], steady))
+    end, knots = jax.lax.scan(lambda x, stage: (stage[0] @ x + stage[1], x), begin, (led[:, :, : at.level], steady))
+    each = jnp.broadcast_to(shared, (knots.shape[0], shared.size))
+    return [jnp.concatenate([x, each], axis=1) for x in (knots, jnp.concatenate([knots[1:], end[None]]))]
 
-    def of_stages(knot):
-        return jnp.concatenate([knot, jnp.broadcast_to(rest, (knot.shape[0], rest.size))], axis=1)
 
-    here, there = of_stages(knot), of_stages(jnp.concatenate([knot[1:], end[None]]))
-    numbers = jnp.concatenate([here, -jnp.einsum("kij,kj->ki", gain, here)], axis=1)
-    numbers = numbers.reshape(stages.cost.shape[:3])
-    rate = jnp.einsum("kij,kj->ki", rate, there).reshape(*numbers.shape[:2], 4)
-    last = jnp.einsum("pij,pj->pi", stages.ends[:, -1], numbers[:, -1])
-    return _together(linear, numbers, last, rest), rest[0], _prices(linear, quadratic, rate, last, rest)
+def _in_turn(stages):
+    """Those of all phases, one after the other."""
+    return stages.reshape(-1, *stages.shape[2:])
 
 
 def _stages(linear: Linear, quadratic: Quadratic) -> _Stages:
     """The stages of a quadratic function; what stays has no part in them."""
     phases, knots = sizes(linear)
-    at = _order(phases, knots)
-    stage = phases, knots - 1
+    at, stage = _order(phases, knots), (phases, knots - 1)
     moves = jnp.where(linear.still, 0.0, 1.0)[columns(linear)]
-
-    def placed(values, axis):
-        """Numbers of an interval's seven among those of its stage."""
-        room = [(0, 0)] * values.ndim
-        room[axis] = (0, 1)
-        return jnp.stack(
-            [jnp.take(v, row[0], axis=axis) for v, row in zip(jnp.pad(values, room), at.local, strict=True)]
-        )
-
-    def counted(values):
-        """Numbers of variables, each in one stage."""
-        return jnp.append(values, 0.0)[at.own]
-
-    def column(values):
-        return values[..., None]
-
-    ends = placed(linear.rates.end * moves[..., None, :], -1)
+    ends = _placed(at, linear.rates.end * moves[..., None, :], -1)
     ends = ends.at[..., at.one].add(linear.defect[: 2 * phases * (knots - 1)].reshape(*stage, 2))
-    goals = sum(column(ends[:, :, k]) * at.ends[k][:, :, None] for k in range(2))
-
-    def none(count):
-        return jnp.zeros((*stage, at.size + 2, count))
-
-    half = [none(4), column(-counted(quadratic.lean)), none(phases), goals, column(-counted(quadratic.pull)), none(2)]
-    half = jnp.concatenate(half, axis=-1)
-    own = counted(quadratic.price)[..., None] * np.eye(at.size + 2)
-    cost = placed(placed(quadratic.blocks * moves[..., None] * moves[..., None, :], -1), -2) + own
-    cost = cost + half + jnp.swapaxes(half, -1, -2)
-
     torques = jnp.broadcast_to(np.eye(at.size + 2)[at.size :], (*stage, 2, at.size + 2))
     onward = jnp.concatenate([ends, torques], axis=2).at[:, -1, :2].set(0.0)
-    if phases > 1:
-        before, across = ends[:-1, -1, 1], linear.across[at.lost]
-        speed = -column(across[np.arange(phases - 1), at.v]) * before
-        speed = speed.at[:, at.durations].add(-jnp.where(linear.still, 0.0, across)[:, -phases:])
-        speed = speed.at[:, at.one].add(-linear.defect[at.lost])
-        onward = onward.at[:-1, -1, 1].set(speed)
-        onward = onward.at[:-1, -1, 2:, at.one].add(-linear.defect[at.steps].reshape(-1, 2))
-        # The speed that is handed over is no number of a stage: what it costs counts where it comes about.
-        price, pull, lean = (column(a[at.v]) * before for a in (quadratic.price, quadratic.pull, quadratic.lean))
-        costs = column(price / 2) * before[:, None]
-        costs = costs.at[..., at.one].add(-pull).at[..., 4].add(-lean)
-        cost = cost.at[:-1, -1].add(costs + jnp.swapaxes(costs, -1, -2))
-    return _Stages(cost, onward, ends)
+    bends = _placed(at, _placed(at, quadratic.blocks * moves[..., None] * moves[..., None, :], -1), -2)
+    price = _own(at, quadratic.price)[..., None] * np.eye(at.size + 2)
+    stages = _Stages(bends + price + _mirrored(_beside(at, quadratic, ends)), onward, ends)
+    return stages if phases == 1 else _handed_over(at, stages, linear, quadratic)
 
 
-def _together(linear: Linear, numbers, last, rest) -> Float[Array, "p"]:
+def _placed(at: _Order, values, axis):
+    """Numbers of an interval's seven along an axis, among those of its stage."""
+    room = [(0, 0)] * values.ndim
+    room[axis] = (0, 1)
+    return jnp.stack([jnp.take(v, own, axis=axis) for v, own in zip(jnp.pad(values, room), at.local, strict=True)])
+
+
+def _own(at: _Order, values):
+    """Numbers of variables, each in one stage."""
+    return jnp.append(values, 0.0)[at.own]
+
+
+def _mirrored(half):
+    return half + jnp.swapaxes(half, -1, -2)
+
+
+def _beside(at: _Order, quadratic: Quadratic, ends):
+    """What is linear, beside 1; what leans on the level, beside it; and what must end as planned, beside its price."""
+    must = (ends[..., None] * at.ends[:, :, :, None]).sum(2)
+
+    def none(count):
+        return jnp.zeros((*must.shape[:3], count))
+
+    lean, pull = -_own(at, quadratic.lean), -_own(at, quadratic.pull)
+    phases = none(must.shape[0])
+    return jnp.concatenate([none(at.level), lean[..., None], phases, must, pull[..., None], none(2)], axis=-1)
+
+
+def _handed_over(at: _Order, stages: _Stages, linear: Linear, quadratic: Quadratic) -> _Stages:
+    """The last stages of phases lead to the first knots of the next: there speeds follow and torques go on."""
+    last, across = stages.ends[:-1, -1, 1], linear.across[at.lost]
+    speed = -linear.across[at.lost, at.v][:, None] * last
+    speed = speed.at[:, at.durations].add(-jnp.where(linear.still, 0.0, across)[:, -len(stages.ends) :])
+    speed = speed.at[:, at.one].add(-linear.defect[at.lost])
+    onward = stages.onward.at[:-1, -1, 1].set(speed)
+    onward = onward.at[:-1, -1, 2:, at.one].add(-linear.defect[at.steps].reshape(-1, 2))
+    # The speed that is handed over is no number of a stage: what it costs counts where it comes about.
+    price, pull, lean = (a[at.v][:, None] * last for a in (quadratic.price, quadratic.pull, quadratic.lean))
+    half = price[..., None] / 2 * last[:, None]
+    half = half.at[..., at.one].add(-pull).at[..., at.level].add(-lean)
+    return stages._replace(cost=stages.cost.at[:-1, -1].add(_mirrored(half)), onward=onward)
+
+
+def _together(linear: Linear, numbers, last, shared) -> Float[Array, "p"]:
     """The changes of all variables; what stays does."""
     at = _order(*sizes(linear))
     torque = jnp.concatenate([numbers[:, :, 2:4], numbers[:, -1:, at.size :]], axis=1)
     state = jnp.concatenate([numbers[:, :, :2], last[:, None]], axis=1)
     phases = numbers.shape[0]
-    way = jnp.concatenate([torque.ravel(), state.ravel(), rest[1 : 1 + phases]])
+    way = jnp.concatenate([torque.ravel(), state.ravel(), shared[1 : 1 + phases]])
     return jnp.where(linear.still, 0.0, way)
 
 
-def _prices(linear: Linear, quadratic: Quadratic, rate, last, rest) -> Float[Array, "e"]:
-    """The price of each equation is what all behind it costs more with what it gives: `rate` at the next knot."""
-    phases = rate.shape[0]
-    at, goals = _order(*sizes(linear)), rest[1 + phases : -1]
-    joins = rate[:, :, :2].at[:, -1, 0].set(goals[:-1]).at[-1, -1, 1].set(goals[-1])
-    lost, steps = -rate[:-1, -1, 1], -rate[:-1, -1, 2:]
-    costs = quadratic.price[at.v] * last[:-1, 1] - quadratic.pull[at.v] - quadratic.lean[at.v] * rest[0]
+def _prices(linear: Linear, quadratic: Quadratic, rates, last, shared) -> Float[Array, "e"]:
+    """The price of each equation is how what all behind it costs grows with what it gives: `rates` at the next knot."""
+    phases = rates.shape[0]
+    at, goals = _order(*sizes(linear)), shared[1 + phases : -1]
+    joins = rates[:, :, :2].at[:, -1, 0].set(goals[:-1]).at[-1, -1, 1].set(goals[-1])
+    lost, steps = -rates[:-1, -1, 1], -rates[:-1, -1, 2:]
+    costs = quadratic.price[at.v] * last[:-1, 1] - quadratic.pull[at.v] - quadratic.lean[at.v] * shared[0]
     handed = costs + linear.across[at.lost, at.v] * lost
     joins = joins.at[:-1, -1, 1].set(handed)
     return jnp.concatenate([joins.ravel(), lost, steps.ravel()])
