@@ -292,7 +292,7 @@ STYLES = {"optimise": "-", "collocation": "--", "best known": ":", "search": "-.
 def draw(cases: list[Case], path) -> None:
     """Left: phases that hold with at most a given loss against the bound; right: plans done within a given time."""
     rows = [row for case in cases for row in case.phases]
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.6), sharey=True, layout="constrained")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.8), sharey=True, layout="constrained")
     losses = {
         "optimise": [1 - r.optimise / r.bound if r.optimise_status == "ok" else np.inf for r in rows],
         "collocation": [1 - r.collocation / r.bound if r.collocation_status == "ok" else np.inf for r in rows],
@@ -306,7 +306,7 @@ def draw(cases: list[Case], path) -> None:
     left.set_ylabel("share of phases or plans [%]")
     times = {
         "optimise": ("optimise", [case.optimise_seconds for case in cases]),
-        "collocation, solving": ("collocation", [case.ipopt_seconds for case in cases]),
+        "collocation": ("collocation", [case.ipopt_seconds for case in cases]),
         "collocation, with building": ("best known", [case.ipopt_seconds + case.build_seconds for case in cases]),
         "search": ("search", [case.search_seconds for case in cases]),
     }
@@ -315,6 +315,8 @@ def draw(cases: list[Case], path) -> None:
         colour = COLOURS["collocation"] if label.startswith("coll") else COLOURS[name]
         _steps(right, values, (every.min() / 1.5, every.max() * 1.5), colour, STYLES[name], label)
     right.set_xlabel("wall time of a plan, warm [s]")
+    lines = {line.get_label(): line for ax in (left, right) for line in ax.lines}
+    figure.legend(lines.values(), lines.keys(), loc="outside upper center", ncols=len(lines), frameon=False, fontsize=8)
     figure.savefig(path)
     plt.close(figure)
 
@@ -335,7 +337,6 @@ def _steps(ax, values, limits: tuple[float, float], colour: str, style, label: s
     ax.set_ylim(0, 103)
     ax.grid(True, which="major", color="#DDDDDD", lw=0.6)
     ax.spines[["top", "right"]].set_visible(False)
-    ax.legend(frameon=False, fontsize=8, loc="best")
 
 
 if __name__ == "__main__":
