@@ -149,6 +149,14 @@ def test_any_optax_optimiser_descends():
     assert float(jnp.abs(found.torque.values).max()) <= 1.0
 
 
+def test_its_torques_do_not_step_where_a_formation_takes_over_at_speed():
+    scene = wa.load("passage")
+    found = wa.optimise(scene, optimiser=optax.adam(0.02), steps=60, knots=31)
+    first = [step.apart for step in found.history if step.start == 0]
+    assert first[0] > 0.1, "its start must have steps"
+    assert first[-1] < 1e-3
+
+
 def test_a_formation_that_cannot_be_held_is_said_before_any_search():
     scene = wa.load("heptagon")
     weak = eqx.tree_at(lambda s: s.hand.torque_limit, scene, jnp.full(2, 0.02))
