@@ -1,6 +1,8 @@
 """What XLA is told: every loop compiled as one function, whatever a user has set left alone."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -10,14 +12,26 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax import settings
 
+LOOKING = """
+import jax
+import wholearm_jax as wa
+
+wa.configure()
+ones = jax.numpy.ones((2000, 2000))
+long = jax.jit(lambda a: a @ a).lower(ones).compile()
+print("here" if long(ones).is_ready() else "handed over")
+"""
+
 
 @pytest.fixture(autouse=True)
 def _jax_has_begun():
     """What these tests write to the environment comes too late for this process."""
     jax.devices()
-    lines = jax.config.values["jax_traceback_in_locations_limit"]
+    names = "jax_traceback_in_locations_limit", "jax_cpu_enable_async_dispatch"
+    before = {name: jax.config.values[name] for name in names}
     yield
-    jax.config.update("jax_traceback_in_locations_limit", lines)
+    for name, value in before.items():
+        jax.config.update(name, value)
 
 
 def test_a_loop_is_one_function():
@@ -60,6 +74,16 @@ def test_programs_carry_lines_of_python_where_they_are_wanted(monkeypatch, compi
     wa.configure(compiled=compiled)
     traced = jax.jit(lambda x: jnp.sin(x) + 1.0).lower(1.0)
     assert (Path(__file__).name in traced.as_text(debug_info=True)) == carried
+
+
+@pytest.mark.parametrize(("given", "handed_over"), [(None, False), ("true", True)])
+def test_programs_run_in_the_thread_that_calls_them(given, handed_over):
+    """As told to the client, which a new process makes once `configure` has spoken."""
+    told = {name: value for name, value in os.environ.items() if name != "JAX_CPU_ENABLE_ASYNC_DISPATCH"}
+    if given:
+        told["JAX_CPU_ENABLE_ASYNC_DISPATCH"] = given
+    looking = subprocess.run([sys.executable, "-c", LOOKING], env=told, capture_output=True, text=True, check=True)
+    assert (looking.stdout.strip() == "handed over") == handed_over
 
 
 def test_another_version_of_jax_is_told_nothing(monkeypatch):
