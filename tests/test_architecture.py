@@ -28,7 +28,7 @@ ORDER = (
         "writing",
         "programs",
     ),
-    *("march", "start", "places", "wire", "reduction"),
+    *("watch", "march", "start", "places", "wire", "reduction"),
     *("schedule", "stepping", "landing", "motion", "forces", "verdict", "holding"),
     *("phase", "result", "resting", "sampling", "plan", "gradient", "gradient_check"),
     *("squeeze", "shooting", "linearisation", "recursion", "descent", "pacing"),

@@ -14,7 +14,6 @@ from test_gradients import nearest_difference
 import wholearm_jax as wa
 from wholearm_jax.contacts import frames, gaps
 from wholearm_jax.forces import REFINED, SAMPLES, arc, score
-from wholearm_jax.march import Watched, crossings
 from wholearm_jax.motion import move
 from wholearm_jax.phase import ending, prepare
 from wholearm_jax.plan import outcomes
@@ -26,6 +25,7 @@ from wholearm_jax.squeeze import hold, holds
 from wholearm_jax.start import _pierced
 from wholearm_jax.stepping import Integration
 from wholearm_jax.system import system
+from wholearm_jax.watch import Watched, crossings
 from wholearm_jax.wire import Resolution
 
 
@@ -258,9 +258,9 @@ def test_a_dip_between_samples_is_found_among_many_low_steps(floor):
 @pytest.mark.parametrize("side", [1, -1])
 def test_what_passes_and_comes_back_within_a_step_is_met_on_its_way_down(side):
     """A vertex that grazes a finger, or its back: it dips through soon, and is back to rounding where the step ends."""
-    pairs = SimpleNamespace(lower=jnp.zeros(1), upper=jnp.ones(1))
-    watched = SimpleNamespace(candidates=pairs, watched=jnp.array([True]), behind=jnp.array([True]))
-    step, inside = 2e-3, jnp.array([0.5])
+    lower, upper = jnp.array([0.0, -jnp.inf]), jnp.array([1.0, jnp.inf])
+    watch = SimpleNamespace(lower=lower, upper=upper, counts=jnp.array([True, True]), behind=jnp.array([True, False]))
+    step, inside = 2e-3, jnp.array([0.5, 0.0])
     gap = np.polynomial.Polynomial.fromroots([0.3 * step, 0.999999 * step])
     steady = jnp.array([1.0])  # some room that nothing changes
 
@@ -270,7 +270,7 @@ def test_what_passes_and_comes_back_within_a_step_is_met_on_its_way_down(side):
 
     assert gap(step) > 0 > gap(0.5 * step)
     for end in (step, 0.999 * step):  # back outside, and not yet
-        crossed, where = crossings(watched, at(0.0), at(end), end, 1e-16)
+        crossed, where = crossings(watch, at(0.0), at(end), end, 1e-16)
         assert list(np.asarray(crossed)) == [True, False]
         assert float(where[0] * end) == pytest.approx(0.3 * step, rel=1e-9)
 

@@ -1,8 +1,8 @@
 """Differentiable dynamics and torque-trajectory optimisation for planar whole-arm manipulation.
 
-Read the modules in this order: `scene`, `contacts`, `system`, `newton`, `march`, `start`, `places` and `wire` (trace),
-`reduction` (reduce), `schedule`, `stepping`, `landing` and `motion` (simulate), `forces` (score), `verdict`, `phase`,
-`result` and `plan`, `squeeze` (quasi-static torques and the bound), `shooting`, `linearisation`, `recursion`,
+Read the modules in this order: `scene`, `contacts`, `system`, `newton`, `watch`, `march`, `start`, `places` and `wire`
+(trace), `reduction` (reduce), `schedule`, `stepping`, `landing` and `motion` (simulate), `forces` (score), `verdict`,
+`phase`, `result` and `plan`, `squeeze` (quasi-static torques and the bound), `shooting`, `linearisation`, `recursion`,
 `descent`, `pacing`, `guesses` and `optimiser` (optimise), `baseline` (the paper's search), `variation` and `batch`
 (many scenes at once), `free_bodies`, `coulomb`, `execution` and `perturbation` (virtual hardware).
 """

@@ -37,19 +37,19 @@ def places_of(system, heading, marched: March, most: int) -> Places:
     """Sharpen the bracketed end and every sign change of slips and joint speeds to rounding level: `most` places."""
     fixed = stop_gradient(system)
     last = jnp.maximum(marched.n - 1, 0)
-    (found,) = jnp.nonzero(marched.flips.ravel(), size=most - 1, fill_value=-1)
+    (found,) = jnp.nonzero(marched.nodes.flips.ravel(), size=most - 1, fill_value=-1)
     used = jnp.append(found >= 0, True)
     segment = jnp.append(jnp.where(found >= 0, found // 7, 0), last)
     what = jnp.append(jnp.where(found >= 0, found % 7, _PLANE), _END)
-    fraction = marched.share[segment, jnp.minimum(what, _PLANE)][:, None]
-    guess = marched.z[segment - 1] * (1 - fraction) + marched.z[segment] * fraction
-    guess = jnp.where(used[:, None], guess, marched.z[0]).at[-1].set(marched.end_z)
+    fraction = marched.nodes.share[segment, jnp.minimum(what, _PLANE)][:, None]
+    guess = marched.nodes.z[segment - 1] * (1 - fraction) + marched.nodes.z[segment] * fraction
+    guess = jnp.where(used[:, None], guess, marched.nodes.z[0]).at[-1].set(marched.end_z)
 
     # A chart ends at the node before the first step in the next one.
-    chart = marched.chart[jnp.maximum(segment - (what == _PLANE), 0)]
+    chart = marched.nodes.chart[jnp.maximum(segment - (what == _PLANE), 0)]
 
     def locate(segment, what, guess, chart):
-        hint = pick(marched.x, jnp.maximum(segment - 1, 0))
+        hint = pick(marched.nodes.x, jnp.maximum(segment - 1, 0))
 
         def vanishing(system, z, x, heading):
             return _vanishing(system, heading, marched, z, x, hint @ (z - guess))[what]
@@ -59,8 +59,8 @@ def places_of(system, heading, marched: March, most: int) -> Places:
 
     z, x, residual, s = jax.vmap(locate)(segment, what, guess, chart)
     slack = jnp.where(what == _END, 4 * SHORTEST, digits(z, 3 / 8))
-    before = jnp.where(segment > 0, marched.s[jnp.maximum(segment - 1, 0)], 0.0)
-    astray = (residual > digits(z, 1 / 2)) | (s < before - slack) | (s > marched.s[segment] + slack)
+    before = jnp.where(segment > 0, marched.nodes.s[jnp.maximum(segment - 1, 0)], 0.0)
+    astray = (residual > digits(z, 1 / 2)) | (s < before - slack) | (s > marched.nodes.s[segment] + slack)
     failed = jnp.any(used & astray)
     kinks = jnp.where(used[:-1], s[:-1], jnp.inf)
     rank = jnp.argsort(stop_gradient(kinks))
@@ -84,10 +84,10 @@ def _vanishing(system, heading, marched, z, x, ahead_of_guess):
 
 def _branches(system, marched, end, astray):
     """Whether the wire meets another one on its way: `det [G; x]` changes sign."""
-    rows, last = jnp.arange(marched.s.shape[0]), jnp.maximum(marched.n - 1, 0)
+    rows, last = jnp.arange(marched.nodes.s.shape[0]), jnp.maximum(marched.n - 1, 0)
     # The last node lies a little beyond the end: it counts only if the end was not found.
-    _, at_end = oriented_tangent(system, end, marched.x[jnp.maximum(last - 1, 0)])
-    along = jnp.where((rows == last) & ~astray, at_end, marched.orientation)
+    _, at_end = oriented_tangent(system, end, marched.nodes.x[jnp.maximum(last - 1, 0)])
+    along = jnp.where((rows == last) & ~astray, at_end, marched.nodes.orientation)
     live = (rows < marched.n) & (rows > 0) & (marched.end >= 0)
     size = jnp.abs(jnp.where(live, along, along[0])).max()
     # Where two wires meet, Newton's method finds the end to half of the digits only.
@@ -96,4 +96,5 @@ def _branches(system, marched, end, astray):
 
 def coordinate(marched: March, chart, z):
     """Where along the wire `z` is, by one of its charts."""
-    return marched.anchor_s[chart] + marched.charts[chart] @ (z - marched.anchors[chart])
+    charts = marched.charts
+    return charts.anchor_s[chart] + charts.direction[chart] @ (z - charts.anchor[chart])

@@ -13,7 +13,7 @@ from wholearm_jax.elimination import inverse, solve, times
 from wholearm_jax.march import oriented_tangent
 from wholearm_jax.newton import newton
 from wholearm_jax.precision import digits
-from wholearm_jax.scene import EDGE
+from wholearm_jax.scene import EDGE, VERTEX
 
 
 def project(system, rough):
@@ -52,36 +52,45 @@ def misplaced(system, z):
     return jnp.any(beyond) | jnp.any(behind) | _pierced(system, pairs, tolerance)
 
 
-# Where each link begins and ends: both fingers from root to tip, the palm from one end to the other.
-_ENDS = (((1, ROOT), (1, EDGE)), ((2, ROOT), (2, EDGE)), ((1, PALM_END), (2, PALM_END)))
-_LINKS = np.array([[GROUPS.index(end) for end in link] for link in _ENDS]).T
+# Where each link begins and ends, and vertices against it: fingers from root to tip, the palm from left to right.
+_ENDS = (
+    ((1, ROOT), (1, EDGE), (1, VERTEX)),
+    ((2, ROOT), (2, EDGE), (2, VERTEX)),
+    ((2, PALM_END), (1, PALM_END), (0, VERTEX)),
+)
+_LINKS = np.array([[GROUPS.index(group) for group in link] for link in _ENDS]).T
 
 
 def _pierced(system, pairs, tolerance):
     """Whether part of a finger's contact edge or of the palm lies within the object.
 
-    Edges of the object cut each link into parts, and the middle of one lies within where edges stand round about it:
-    seen from there they turn by a whole circle. Gaps and places along edges are linear on a link.
+    Lines through edges of the object cut each link into parts, and the middle of one lies within where the outline
+    passes the rest of the link's line an odd number of times. Gaps and places along edges are linear on a link.
     """
-    grouped = (pairs.gap, pairs.along, system.candidates.upper, system.real)
-    gap, along, upper, real = (a.reshape(len(GROUPS), -1) for a in grouped)
-    begin, end = _LINKS
+    grouped = (pairs.gap, pairs.along, system.candidates.lower, system.candidates.upper, system.real)
+    gap, along, lower, upper, real = (a.reshape(len(GROUPS), -1) for a in grouped)
+    begin, end, against = _LINKS
 
     def on(values, share):
         return values[begin][:, None] + share[..., None] * (values[end] - values[begin])[:, None]
 
-    upper, real = upper[end[0]], real[end[0]]  # the edges' own, whatever is on them
     across = gap[begin] - gap[end]
     share = gap[begin] / jnp.where(across == 0, 1.0, across)
-    cut = real & (across != 0) & (share > 0) & (share < 1)
-    ends = jnp.zeros((3, 1), share.dtype)
-    stops = jnp.sort(jnp.concatenate([ends, jnp.where(cut, share, 1.0), ends + 1.0], axis=1), axis=1)
-    middle = (stops[:, 1:] + stops[:, :-1]) / 2
-    gap, along = on(gap, middle), on(along, middle)
-    beside = real & (jnp.abs(gap) < tolerance) & (along > -tolerance) & (along < upper + tolerance)
-    below = jnp.where(gap == 0, 1.0, -gap)
-    turned = jnp.where(real, jnp.arctan(along / below) + jnp.arctan((upper - along) / below), 0.0).sum(-1)
-    return jnp.any((turned > jnp.pi) & ~beside.any(-1))
+    cut = real[begin] & (across != 0) & (share > 0) & (share < 1)
+    stops = jnp.concatenate([jnp.zeros((3, 1), share.dtype), jnp.where(cut, share, 1.0)], axis=1)
+    after = jnp.where(stops[:, None] > stops[..., None], stops[:, None], 1.0).min(-1)
+    middle = (stops + after) / 2
+    length = upper[end[0]]  # the edges' own, whatever is on them
+    near, place = jnp.abs(on(gap, middle)) < tolerance, on(along, middle)
+    beside = (real[begin][:, None] & near & (place > -tolerance) & (place < length + tolerance)).any(-1)
+
+    front, where, last = gap[against], along[against], real[against] & ~jnp.roll(real[against], -1, axis=1)
+    front_next, where_next = (jnp.where(last, a[:, :1], jnp.roll(a, -1, axis=1)) for a in (front, where))
+    passes = real[against] & ((front > 0) != (front_next > 0))
+    passed = where + (where_next - where) * front / jnp.where(passes, front - front_next, 1.0)
+    here = lower[against, :1] + middle * (upper - lower)[against, :1]
+    times_ahead = (passes[:, None] & (passed[:, None] > here[..., None])).sum(-1)
+    return jnp.any((after > stops) & (times_ahead % 2 == 1) & ~beside)
 
 
 def dependent(system, z):

@@ -146,10 +146,11 @@ def _lay(marched, places, start, resolution) -> Pieces:
     before_end = stop_gradient(places.s) < stop_gradient(places.end_s) - digits(places.end_s, 5 / 8)
     inside = jnp.isfinite(places.s) & before_end
     count = inside.sum() + 1
-    last = marched.chart[jnp.maximum(marched.n - 1, 0)]
+    last = marched.nodes.chart[jnp.maximum(marched.n - 1, 0)]
     # Piece k ends at place k, which lies in the chart of the segment before it.
     owner_chart = jnp.append(jnp.where(inside, places.chart, last), last)
-    chart, anchor = marched.charts[owner_chart], marched.anchors[owner_chart]
+    directions = marched.charts.direction
+    chart, anchor = directions[owner_chart], marched.charts.anchor[owner_chart]
     entry = jnp.concatenate([start[None], places.z])
     live = jnp.arange(resolution.pieces) < count
 
@@ -158,12 +159,12 @@ def _lay(marched, places, start, resolution) -> Pieces:
     by_chart = jax.vmap(coordinate, (None, 0, 0))
     jump = jnp.where(live, by_chart(marched, before, entry) - by_chart(marched, owner_chart, entry), 0.0)
     shift = jnp.cumsum(jump)
-    anchor_s = marched.anchor_s[owner_chart] + shift
+    anchor_s = marched.charts.anchor_s[owner_chart] + shift
     end_s = places.end_s + shift[-1]
     kinks = jnp.where(inside, jnp.where(inside, places.s, 0.0) + shift[:-1], end_s)
     breaks = jnp.concatenate([coordinate(marched, 0, start)[None], kinks, end_s[None]])
 
-    old = marched.charts[before]
+    old = directions[before]
     before_entry = jnp.where(live[1:], (old[1:] * places.x).sum(1), 1.0)
     factor = jnp.append(1.0, jnp.where(live[1:], (chart[1:] * places.x).sum(1) / before_entry, 1.0))
     return Pieces(count, breaks, chart, anchor, anchor_s, factor)
@@ -234,13 +235,14 @@ def _panels(breaks, count, resolution):
 
 def _interpolate(marched, s, u):
     """Cubic Hermite guess of `z` at every `s` from the march's nodes."""
-    right = jnp.clip(jnp.searchsorted(marched.s, s), 1, jnp.maximum(marched.n - 1, 1))
+    nodes = marched.nodes
+    right = jnp.clip(jnp.searchsorted(nodes.s, s), 1, jnp.maximum(marched.n - 1, 1))
     left = right - 1
-    width = marched.s[right] - marched.s[left]
+    width = nodes.s[right] - nodes.s[left]
     width = jnp.where(jnp.isfinite(width) & (width > 0), width, 1.0)[..., None]
-    f = ((s - marched.s[left])[..., None]) / width
-    slope = [marched.x[k] / jnp.einsum("pni,pi->pn", marched.x[k], u)[..., None] * width for k in (left, right)]
-    low, high = marched.z[left], marched.z[right]
+    f = ((s - nodes.s[left])[..., None]) / width
+    slope = [nodes.x[k] / jnp.einsum("pni,pi->pn", nodes.x[k], u)[..., None] * width for k in (left, right)]
+    low, high = nodes.z[left], nodes.z[right]
     return (
         low * (1 + 2 * f) * (1 - f) ** 2
         + high * f**2 * (3 - 2 * f)
