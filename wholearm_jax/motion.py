@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
+from wholearm_jax.elimination import times
 from wholearm_jax.landing import acceleration, land
 from wholearm_jax.lookup import pick
 from wholearm_jax.reduction import Table, on_panel, powers
@@ -299,8 +300,8 @@ def _departure(table, seen, state):
     tau_low = jax.vmap(torque_in, (None, 0, 0))(seen, rows, low)
 
     def first(pull):
-        value = pull[0] + tau_low @ pull[1:]
-        rate = seen.slope @ pull[1:]
+        value = pull[0] + times(tau_low, pull[1:])
+        rate = times(seen.slope, pull[1:])
         root = low - value / jnp.where(rate > 0, rate, 1.0)
         at = jnp.where(value > 0, low, jnp.where((rate > 0) & (root < inside), root, jnp.inf))
         at = jnp.where(live, at, jnp.inf)
