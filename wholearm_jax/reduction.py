@@ -273,10 +273,12 @@ def _fitted(columns: dict[str, Float[Array, "panels nodes *shape"]]) -> tuple[di
 def _by_rows(
     matrix: np.ndarray, values: Float[Array, "panels nodes functions"]
 ) -> Float[Array, "panels rows functions"]:
-    """A matrix times the values at every panel's nodes, as a sum over the nodes, whose terms run over the functions: a
-    product of so small matrices runs over the nodes, and takes five times as long."""
-    terms = (matrix[:, k, None] * values[:, None, k] for k in range(1, matrix.shape[1]))
-    return sum(terms, values[:, :1] * matrix[:, :1])
+    """A matrix times the values at every panel's nodes, as a sum over the nodes whose terms run over the functions:
+    products of so small matrices run over the nodes, and take longer."""
+    found = values[:, :1] * matrix[:, :1]
+    for k in range(1, matrix.shape[1]):
+        found = found + values[:, None, k] * matrix[:, k, None]
+    return found
 
 
 def _error(values: Float[Array, "panels nodes functions"], last: Float[Array, "panels four functions"]):
