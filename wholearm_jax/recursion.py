@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from wholearm_jax.elimination import times
 from wholearm_jax.linearisation import Linear, blocks, columns, gather, of_states, sizes
 
 SPREAD = 1e-8  # price of the square of any change: what no room depends on stays where it is
@@ -142,7 +143,7 @@ def _back(at: _Order, stages: _Stages, quadratic: Quadratic):
     def back(value, stage):
         cost, onward = stage
         onward = jnp.concatenate([onward, kept])
-        whole = onward.T @ (value @ onward) + cost
+        whole = times(onward.T, times(value, onward)) + cost  # sums of products: the loop is compiled whole
         (a, b), (_, c) = whole[size:, size:]
         first, second = whole[size:, :size]
         gain = jnp.stack([c * first - b * second, a * second - b * first]) / (a * c - b * b)
@@ -158,7 +159,7 @@ def _forth(at: _Order, stages: _Stages, gain, torque, shared):
     led = onward[:, :, : at.size] - onward[:, :, at.size :] @ gain
     steady = led[:, :, at.level :] @ shared
     begin = jnp.concatenate([jnp.zeros(2), torque])
-    end, knots = jax.lax.scan(lambda x, stage: (stage[0] @ x + stage[1], x), begin, (led[:, :, : at.level], steady))
+    end, knots = jax.lax.scan(lambda x, stage: (times(stage[0], x) + stage[1], x), begin, (led[:, :, : at.level], steady))
     each = jnp.broadcast_to(shared, (knots.shape[0], shared.size))
     return [jnp.concatenate([x, each], axis=1) for x in (knots, jnp.concatenate([knots[1:], end[None]]))]
 
