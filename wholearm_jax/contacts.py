@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from wholearm_jax.elimination import times
 from wholearm_jax.scene import EDGE, VERTEX, Body, Formation, Hand, next_vertex
 
 ROOT, PALM_END = 2, 3  # corners that no formation holds, at an edge of the object: where a finger or the palm begins
@@ -87,7 +88,7 @@ def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
     length = jnp.sqrt((extent**2).sum(1))
     along_palm = np.array([1.0, 0.0])  # which ends beside the fingers' joints, these wherever they are
     palm_lower, palm_upper = hand.joint[1, 0], hand.joint[0, 0]
-    reach = finger @ hand.length
+    reach = times(finger, hand.length)
 
     def components(vectors) -> Vector:
         return vectors[:, 0], vectors[:, 1]
@@ -96,9 +97,9 @@ def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
         on_link=on_link,
         finger=components(finger),
         side=jnp.where(formation.link == 2, -1.0, 1.0).astype(body.mass.dtype),
-        joint=components(of_finger @ hand.joint * jnp.where(of_palm, along_palm, 1.0)),
+        joint=components(times(of_finger, hand.joint) * jnp.where(of_palm, along_palm, 1.0)),
         reach=jnp.where(corner, 0.0, reach),
-        offset=finger @ hand.offset,
+        offset=times(finger, hand.offset),
         point=components(start),
         edge=components(extent / length[:, None]),
         lower=jnp.where(on_link & palm, palm_lower, beside),

@@ -159,7 +159,9 @@ def _forth(at: _Order, stages: _Stages, gain, torque, shared):
     led = onward[:, :, : at.size] - onward[:, :, at.size :] @ gain
     steady = led[:, :, at.level :] @ shared
     begin = jnp.concatenate([jnp.zeros(2), torque])
-    end, knots = jax.lax.scan(lambda x, stage: (times(stage[0], x) + stage[1], x), begin, (led[:, :, : at.level], steady))
+    end, knots = jax.lax.scan(
+        lambda x, stage: (times(stage[0], x) + stage[1], x), begin, (led[:, :, : at.level], steady)
+    )
     each = jnp.broadcast_to(shared, (knots.shape[0], shared.size))
     return [jnp.concatenate([x, each], axis=1) for x in (knots, jnp.concatenate([knots[1:], end[None]]))]
 
