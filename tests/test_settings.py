@@ -11,10 +11,7 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax import settings
-from wholearm_jax.batch import QUICK
-from wholearm_jax.plan import traced_together
 from wholearm_jax.recursion import Quadratic, _back, _order, _Stages
-from wholearm_jax.variation import vary
 
 LOOKING = """
 import jax
@@ -45,20 +42,13 @@ def test_a_loop_is_one_function():
     assert "xla_cpu_small_call" in jax.jit(go).lower(jnp.ones(1000)).compile().as_text()
 
 
-def test_checks_and_recursions_are_one_function():
-    """Calls of libraries, as for products of matrices and for sorting, would keep the loops about them in pieces."""
-    ensemble = vary(wa.load("heptagon"), {"vertices": 1e-4}, seed=0)
-
-    def tables(numbers):
-        return jax.lax.map(lambda k: traced_together(ensemble.draw(k), QUICK.resolution).table, numbers)
-
+def test_the_recursion_over_knots_is_one_function():
+    """Calls of libraries, as for products of matrices, would keep the loop about them in pieces."""
     at = _order(1, 9)
-    each = (1, 8, at.size + 2)
-    stages = _Stages(*(jnp.ones((*each[:2], rows, each[2])) for rows in (each[2], 4, 2)))
+    stages = _Stages(*(jnp.ones((1, 8, rows, at.size + 2)) for rows in (at.size + 2, 4, 2)))
     quadratic = Quadratic(*(jnp.ones(()) for _ in Quadratic._fields))
-    for function, given in ((tables, jnp.arange(2)), (lambda stages: _back(at, stages, quadratic), stages)):
-        text = jax.jit(function).lower(given).compile().as_text()
-        assert text.count(" while(") == text.count('xla_cpu_small_call="true"') > 0
+    text = jax.jit(lambda stages: _back(at, stages, quadratic)).lower(stages).compile().as_text()
+    assert text.count(" while(") == text.count('xla_cpu_small_call="true"') > 0
 
 
 @pytest.mark.parametrize(

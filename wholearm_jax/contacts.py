@@ -23,7 +23,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from wholearm_jax.elimination import times
 from wholearm_jax.scene import EDGE, VERTEX, Body, Formation, Hand, next_vertex
 
 ROOT, PALM_END = 2, 3  # corners that no formation holds, at an edge of the object: where a finger or the palm begins
@@ -88,7 +87,7 @@ def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
     length = jnp.sqrt((extent**2).sum(1))
     along_palm = np.array([1.0, 0.0])  # which ends beside the fingers' joints, these wherever they are
     palm_lower, palm_upper = hand.joint[1, 0], hand.joint[0, 0]
-    reach = times(finger, hand.length)
+    reach = finger @ hand.length
 
     def components(vectors) -> Vector:
         return vectors[:, 0], vectors[:, 1]
@@ -97,9 +96,9 @@ def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
         on_link=on_link,
         finger=components(finger),
         side=jnp.where(formation.link == 2, -1.0, 1.0).astype(body.mass.dtype),
-        joint=components(times(of_finger, hand.joint) * jnp.where(of_palm, along_palm, 1.0)),
+        joint=components(of_finger @ hand.joint * jnp.where(of_palm, along_palm, 1.0)),
         reach=jnp.where(corner, 0.0, reach),
-        offset=times(finger, hand.offset),
+        offset=finger @ hand.offset,
         point=components(start),
         edge=components(extent / length[:, None]),
         lower=jnp.where(on_link & palm, palm_lower, beside),

@@ -81,8 +81,7 @@ _PAIRS, _UPPER, _LOWER, _SIGNS = _laplace()
 
 def times(matrix: Float[Array, "m n"], right: Float[Array, "n *columns"]) -> Float[Array, "m *columns"]:
     """The product with a vector or a matrix, as a sum of products, which is fused with what is about it: a call of a
-    library for matrices would take longer to prepare than it computes, and keeps the loop about it from being compiled
-    whole."""
+    library for matrices would take longer to prepare than it computes."""
     if right.ndim == 1:
         return (matrix * right).sum(1)
     return sum((matrix[:, k, None] * right[k] for k in range(1, len(right))), matrix[:, :1] * right[0])

@@ -63,17 +63,9 @@ def places_of(system, heading, marched: March, most: int) -> Places:
     astray = (residual > digits(z, 1 / 2)) | (s < before - slack) | (s > marched.nodes.s[segment] + slack)
     failed = jnp.any(used & astray)
     kinks = jnp.where(used[:-1], s[:-1], jnp.inf)
-    rank = _in_order(stop_gradient(kinks))
+    rank = jnp.argsort(stop_gradient(kinks))
     branched = _branches(fixed, marched, stop_gradient(z[-1]), astray[-1])
     return Places(z[rank], x[rank], kinks[rank], chart[rank], z[-1], s[-1], branched, failed)
-
-
-def _in_order(values):
-    """`argsort` of few values, by counting those that stand before each: sorting is a call of a library, which keeps
-    the loop about it from being compiled whole."""
-    rows = jnp.arange(values.shape[0])
-    before = (values < values[:, None]) | ((values == values[:, None]) & (rows < rows[:, None]))
-    return jnp.zeros_like(rows).at[before.sum(1)].set(rows)
 
 
 def _vanishing(system, heading, marched, z, x, ahead_of_guess):

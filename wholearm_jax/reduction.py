@@ -105,7 +105,7 @@ def reduce_wire(system: System, wire: Wire) -> Table:
         ahead, with_friction = inverse(matrix)
         # Friction may turn the determinant's sign only by passing through a singular matrix. Without friction,
         # det [M x, -G^T] = x.M x det [G; u]: of M x only the part along x is not in the span of G^T.
-        without = stop_gradient((system.inertia * x**2).sum() * along.determinant)
+        without = stop_gradient(system.inertia @ x**2 * along.determinant)
         upright = stop_gradient(with_friction) * without
         solution = times(ahead, right)
         # Orthogonal to the contacts' wrenches nothing but M x a is left.

@@ -180,7 +180,7 @@ def _cut(system, fixed, marched, places, start, resolution):
     guess = _interpolate(marched, stop_gradient(s), laid.chart[owner])
 
     def node(s, guess, u, anchor, anchor_s):
-        height = (u * anchor).sum() + s - anchor_s
+        height = u @ anchor + s - anchor_s
         z, moved, inverted, _ = correct(fixed, u, guess, stop_gradient(height), 2, digits(guess, 3 / 8))
 
         def equations(z, system, height):
@@ -241,7 +241,7 @@ def _interpolate(marched, s, u):
     width = nodes.s[right] - nodes.s[left]
     width = jnp.where(jnp.isfinite(width) & (width > 0), width, 1.0)[..., None]
     f = ((s - nodes.s[left])[..., None]) / width
-    slope = [nodes.x[k] / (nodes.x[k] * u[:, None]).sum(-1, keepdims=True) * width for k in (left, right)]
+    slope = [nodes.x[k] / jnp.einsum("pni,pi->pn", nodes.x[k], u)[..., None] * width for k in (left, right)]
     low, high = nodes.z[left], nodes.z[right]
     return (
         low * (1 + 2 * f) * (1 - f) ** 2
