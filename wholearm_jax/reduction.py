@@ -262,23 +262,12 @@ def _fitted(columns: dict[str, Float[Array, "panels nodes *shape"]]) -> tuple[di
     to_powers, to_last = _transforms(every.shape[1])
     ends = np.cumsum([math.prod(c.shape[2:]) for c in columns.values()])[:-1]
     powers, lasts = (
-        jnp.split(_by_rows(matrix, values), ends, axis=2)
+        jnp.split(jax.vmap(times, (None, 0))(jnp.asarray(matrix), values), ends, axis=2)
         for matrix, values in ((to_powers, every), (to_last, stop_gradient(every)))
     )
     fitted = {name: each.reshape(c.shape) for (name, c), each in zip(columns.items(), powers, strict=True)}
     errors = [_error(c.reshape(*c.shape[:2], -1), last) for c, last in zip(columns.values(), lasts, strict=True)]
     return fitted, jnp.stack(errors).max()
-
-
-def _by_rows(
-    matrix: np.ndarray, values: Float[Array, "panels nodes functions"]
-) -> Float[Array, "panels rows functions"]:
-    """A matrix times the values at every panel's nodes, as a sum over the nodes whose terms run over the functions:
-    products of so small matrices run over the nodes, and take longer."""
-    found = values[:, :1] * matrix[:, :1]
-    for k in range(1, matrix.shape[1]):
-        found = found + values[:, None, k] * matrix[:, k, None]
-    return found
 
 
 def _error(values: Float[Array, "panels nodes functions"], last: Float[Array, "panels four functions"]):

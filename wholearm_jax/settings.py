@@ -22,8 +22,8 @@ def configure(*, compiled: Literal["quickly", "well"] = "quickly") -> None:
     `"quickly"`, as suits single scenes, kernels come from XLA's older emitters and are optimised little, and programs
     do not carry the lines of Python that a profiler would show: half of the compile time. Compiled `"well"`, as suits
     `check`, very many scenes run faster by an eighth. Programs run in the thread that calls them: handing each to
-    another costs more than it overlaps (a motion takes 0.7 of the time, an optimisation 0.92). What the environment
-    says already stays as it is: `XLA_FLAGS`, `JAX_TRACEBACK_IN_LOCATIONS_LIMIT`, `JAX_CPU_ENABLE_ASYNC_DISPATCH`.
+    another costs more than it overlaps (a motion takes 0.66 of the time). What the environment says already stays as
+    it is: `XLA_FLAGS`, `JAX_TRACEBACK_IN_LOCATIONS_LIMIT`, `JAX_CPU_ENABLE_ASYNC_DISPATCH`.
 
     >>> wa.configure()
     """
