@@ -93,11 +93,13 @@ class _Way(NamedTuple):
 
     `last` is the last node within the wire, `earlier` the one before it, `chart` the last one; kept beside the rows,
     which are only ever written: what is read as well would be copied in each step. `speeds` are those of the last node,
-    `sense` the signs that they had last. `before` is what is watched at the last node, `beyond` at the last one tried.
+    `sense` the signs that they had last. `near` says that the last try came past the end of the wire: the next one
+    stops just short of it, and the one after that goes over it. `before` is what is watched at the last node, `beyond` at the last one tried.
     """
 
     n: Int[Array, ""]
     step: Float[Array, ""]
+    near: Bool[Array, ""]
     last: Node
     earlier: Node
     number: Int[Array, ""]
@@ -137,6 +139,7 @@ def _begin(z, x, watch: Watch, capacity: int) -> _Way:
     return _Way(
         n=whole,
         step=zero,
+        near=jnp.asarray(False),
         last=start,
         earlier=start,
         number=whole,
@@ -161,7 +164,7 @@ def _step(system: System, watch: Watch, tolerance, capacity: int, way: _Way) -> 
     x, orientation = _normalised(inverted, determinant)
     watched = watch.at(z, x / (u @ x))
     good = (moved < tolerance) & (x @ last.x > 0.98) & jnp.all(jnp.isfinite(x))
-    crossed, _ = crossings(watch, way.before, watched, way.step, tolerance)
+    crossed, where = crossings(watch, way.before, watched, way.step, tolerance)
     ends = good & jnp.any(crossed)
     bracketed = ends & (way.step <= SHORTEST)
     accept = good & ~jnp.any(crossed)
@@ -174,7 +177,10 @@ def _step(system: System, watch: Watch, tolerance, capacity: int, way: _Way) -> 
     flips, share = jnp.append(flips, way.number != last.chart), jnp.append(share, 0.0)
     tried = Node(z, x, last.s + way.step, flips, share, orientation, way.number)
     chart = Chart(x, z, tried.s)
-    shorter = jnp.where(ends, jnp.maximum(way.step / 4, SHORTEST), way.step / 2)
+    before_end = way.step * jnp.where(crossed, where, 1.0).min() - SHORTEST / 2
+    before_end = jnp.maximum(jnp.where(way.near, way.step / 4, before_end), SHORTEST)
+    shorter = jnp.where(ends, before_end, way.step / 2)
+    longer = jnp.where(way.n > 0, jnp.minimum(way.step * 1.5, LONGEST), LONGEST)
     lost = ~good & (way.step < 1e-6)
     full = (way.n + 1 >= capacity) | (number >= CHARTS)
     in_chart = watched._replace(rates=watched.rates * jnp.where(turn, u @ x, 1.0))
@@ -184,7 +190,8 @@ def _step(system: System, watch: Watch, tolerance, capacity: int, way: _Way) -> 
 
     return _Way(
         n=way.n + (accept | bracketed),
-        step=jnp.where(accept, jnp.where(way.n > 0, jnp.minimum(way.step * 1.5, LONGEST), LONGEST), shorter),
+        step=jnp.where(accept, jnp.where(way.near, SHORTEST, longer), shorter),
+        near=ends,
         last=kept(accept, tried, last),
         earlier=kept(accept, last, way.earlier),
         number=number,
