@@ -1,9 +1,9 @@
 """Check: one torque schedule against very many scenes, each traced, reduced, simulated, scored and judged.
 
-Two programs, compiled side by side, serve all scenes: one traces and tabulates the wires of a plan, the other simulates
-it on the tables; each is a scan over its phases. A CPU does a block of scenes one after the other, each with loops that
-do what it needs and no more; a GPU does them side by side (`jax.vmap`), as does a CPU where all have the same wires,
-which are then traced once a block. Where there are several devices `shard_map` gives each its own block. A chunk is a
+Two programs, compiled side by side, serve all scenes: one traces the wires of a plan, the other reduces the equations
+of motion on them and simulates; each is a scan over its phases. A CPU does a block of scenes one after the other, each
+with loops that do what it needs and no more; a GPU does them side by side (`jax.vmap`). Where all scenes have the same
+wires, these are traced once a block. Where there are several devices `shard_map` gives each its own block. A chunk is a
 number of blocks. The first pass is coarse (`QUICK`): few panels, fewer steps. It knows its error; scenes for which that
 is too large, or which ran out of steps, are packed together and done again at full resolution (`FULL`), and what is
 left then alone, by `plan.simulate`. So neither the slowest scene nor one that cannot be followed holds up the others
@@ -12,6 +12,7 @@ or touches their results.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
@@ -31,19 +32,20 @@ from wholearm_jax.plan import (
     simulate_told,
     stacked,
     steps_within,
-    traced_together,
+    wires_together,
 )
 from wholearm_jax.programs import Program, beside, wait
-from wholearm_jax.reduction import Table, blank
+from wholearm_jax.reduction import Table, reduce_wire
 from wholearm_jax.requirements import require_positive, require_x64
 from wholearm_jax.resting import surely_held
 from wholearm_jax.result import Result
-from wholearm_jax.scene import Formation, Scene
+from wholearm_jax.scene import Formation, Scene, body
 from wholearm_jax.schedule import Torque, padded
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
+from wholearm_jax.system import system
 from wholearm_jax.variation import Ensemble, stack
-from wholearm_jax.wire import Resolution
+from wholearm_jax.wire import Resolution, Wire, blank
 
 BLOCK = 128  # scenes that one device takes at once
 CHUNK = 4096  # scenes whose results are kept together
@@ -236,24 +238,23 @@ def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):
 
 
 def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Level, mesh: Mesh):
-    """Check `BLOCK` scenes a device: on a processor one after the other, but scenes that share their wires are traced
-    together, once."""
+    """Check `BLOCK` scenes a device: on a processor one after the other."""
     side_by_side = mesh.devices.flat[0].platform != "cpu"
     told = source, schedule, arrival, level, side_by_side
     compiled = beside(_check_blank, mesh, told, numbers)
-    tables = _on(mesh, _tables_of, (source, level, side_by_side or source.same_wires), numbers)
+    wires = _on(mesh, _wires_of, (source, level.resolution, side_by_side), numbers)
     wait(compiled)
-    return _on(mesh, _checks_of, told, numbers, tables)
+    return _on(mesh, _checks_of, told, numbers, wires)
 
 
 def _check_blank(mesh: Mesh, told: tuple, numbers) -> None:
-    """Check scenes on tables without wires: that compiles the program for those that have some."""
+    """Check scenes on wires that were not found: that compiles the program for those that were."""
     source, _, _, level, _ = told
-    shape = len(numbers), len(source.nominal.phases)
-    tables = jax.tree.map(lambda a: np.broadcast_to(a, (*shape, *a.shape)), blank(level.resolution))
+    shape = mesh.size if source.same_wires else len(numbers), len(source.nominal.phases)
+    wires = jax.tree.map(lambda a: np.broadcast_to(a, (*shape, *a.shape)), blank(level.resolution))
     if mesh.size > 1:  # where those that are traced will be
-        tables = jax.device_put(tables, NamedSharding(mesh, PartitionSpec("scenes")))
-    _on(mesh, _checks_of, told, numbers, tables)
+        wires = jax.device_put(wires, NamedSharding(mesh, PartitionSpec("scenes")))
+    _on(mesh, _checks_of, told, numbers, wires)
 
 
 def _on(mesh: Mesh, program: Program, told: tuple, *each):
@@ -274,48 +275,55 @@ def _apart(mesh: Mesh, program: Program, told: tuple, *each):
 
 
 @Program
-def _tables_of(told, numbers):
-    """The tables of scenes' wires, scenes one after the other or side by side."""
-    source, level, side_by_side = told
+def _wires_of(told, numbers):
+    """The wires of scenes: of one alone where all have the same."""
+    source, resolution, side_by_side = told
 
     def one(number):
-        return traced_together(source.draw(number), level.resolution).table
+        return wires_together(source.draw(number), resolution)
 
-    return jax.vmap(one)(numbers) if side_by_side else jax.lax.map(one, numbers)
+    return _each(one, side_by_side)(numbers[:1] if source.same_wires else numbers)
 
 
 @Program
-def _checks_of(told, numbers, tables):
-    """Check scenes on their tables."""
+def _checks_of(told, numbers, wires):
+    """Check scenes on their wires."""
     source, schedule, arrival, level, side_by_side = told
 
-    def one(scene):
-        number, tables = scene
-        return check_tables(source.draw(number), tables, schedule, arrival, level)
+    def on_wires(number, wires):
+        return check_wires(source.draw(number), wires, schedule, arrival, level)
 
-    scenes = numbers, tables
-    return jax.vmap(one)(scenes) if side_by_side else jax.lax.map(one, scenes)
+    if source.same_wires:
+        shared = jax.tree.map(lambda a: a[0], wires)
+        return _each(lambda number: on_wires(number, shared), side_by_side)(numbers)
+    return _each(lambda one: on_wires(*one), side_by_side)((numbers, wires))
+
+
+def _each(function, side_by_side: bool):
+    """A function of many, side by side or one after the other."""
+    return jax.vmap(function) if side_by_side else partial(jax.lax.map, function)
 
 
 def check_scene(scene: Scene, schedule: Torque, arrival, level: Level) -> tuple[Checked, Int[Array, ""]]:
     """Check one scene (under any transformation), and say whether this level's result is `GOOD`, or wants a `FINER` one
     or `simulate` for this scene `ALONE`."""
-    return check_tables(scene, traced_together(scene, level.resolution).table, schedule, arrival, level)
+    return check_wires(scene, wires_together(scene, level.resolution), schedule, arrival, level)
 
 
-def check_tables(
-    scene: Scene, tables: Table, schedule: Torque, arrival, level: Level
-) -> tuple[Checked, Int[Array, ""]]:
-    """Check one scene on the tables of its wires."""
+def check_wires(scene: Scene, wires: Wire, schedule: Torque, arrival, level: Level) -> tuple[Checked, Int[Array, ""]]:
+    """Check one scene on its wires."""
+    solid = body(scene.object)
 
     def one(clock, phase):
-        table, motion, formation = phase
+        wire, motion, formation = phase
+        mechanics = system(solid, scene.hand, scene.gravity, formation)
+        table = reduce_wire(mechanics, wire)
         clock, done = simulate_next(schedule, level.how, arrival, clock, (table, *motion))
-        held = surely_held(scene, formation, table, schedule, done)
+        held = surely_held(mechanics, table, schedule, done)
         return clock, _stop(table, done, formation, level, held)
 
     told = stacked([(simulate_told(p), p.formation) for p in scene.phases])
-    _, stops = jax.lax.scan(one, simulate_first(schedule), (tables, *told))
+    _, stops = jax.lax.scan(one, simulate_first(schedule), (wires, *told))
     failed = stops.status != int(Status.OK)
     where = jnp.where(failed.any(), jnp.argmax(failed), jnp.argmin(stops.margin))
     last = jnp.where(failed.any(), where, len(scene.phases) - 1)

@@ -92,9 +92,10 @@ class _Way(NamedTuple):
     """A march on its way, its `nodes` and `charts` so far with one row more, for what is not kept.
 
     `last` is the last node within the wire, `earlier` the one before it, `chart` the last one; kept beside the rows,
-    which are only ever written: what is read as well would be copied in each step. `speeds` are those of the last node,
-    `sense` the signs that they had last. `near` says that the last try came past the end of the wire: the next one
-    stops just short of it, and the one after that goes over it. `before` is what is watched at the last node, `beyond` at the last one tried.
+    which are only ever written: what is read as well would be copied in each step. `near` says that the last try came
+    past the end of the wire: the next one stops just short of it, and the one after that goes over it. `speeds` are
+    those of the last node, `sense` the signs that they had last. `before` is what is watched at the last node, `beyond`
+    at the last one tried.
     """
 
     n: Int[Array, ""]

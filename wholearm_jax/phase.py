@@ -18,11 +18,11 @@ from wholearm_jax.motion import Motion, move
 from wholearm_jax.precision import array, digits, given
 from wholearm_jax.programs import Program
 from wholearm_jax.reduction import Change, Table, blank, change, on_panel, powers, reduce_wire
-from wholearm_jax.scene import Phase, Scene, contact_name
+from wholearm_jax.scene import Heading, Phase, Scene, contact_name
 from wholearm_jax.schedule import Torque, evenly, window
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration, tolerance_as_data
-from wholearm_jax.system import system
+from wholearm_jax.system import System, system
 from wholearm_jax.verdict import ARRIVAL, GOALS, Verdict, judge
 from wholearm_jax.wire import LEFT, MADE, UNTIL, Resolution, Wire, trace_wire
 
@@ -62,22 +62,26 @@ def prepare(
     only `holds` the object, its wire must not end where it begins. Else the status refuses it.
     """
     mechanics = system(scene_body, hand, gravity, formation)
+    wire, begin, end = follow(mechanics, rough, heading, resolution, first, holds)
+    return _strong(Traced(wire, reduce_wire(mechanics, wire), begin, end))
+
+
+def follow(mechanics: System, rough, heading: Heading, resolution: Resolution, first, holds):
+    """The wire of `prepare`, and `z` (SI) where it begins and ends; its status refuses one that does not join the phase
+    before, or leads nowhere."""
     wire = trace_wire(mechanics, rough, heading, resolution)
-    table = reduce_wire(mechanics, wire)
-    begin = start_configuration(table)
-    end = configuration(table, table.count - 1, table.breaks[-1])
-    table = eqx.tree_at(lambda t: t.status, table, _joined(table, jnp.abs(begin - rough).max(), first, holds))
-    # Weak types, which depend on how a constant was written, would make a second program of the next one.
-    return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), Traced(wire, table, begin, end))
-
-
-def _joined(table: Table, apart: Float[Array, ""], first, holds) -> Int[Array, ""]:
-    """The status of a table, with that of a wire that does not join the one before or leads nowhere."""
-    known = table.status == int(Status.OK)
+    begin, end = (z * mechanics.configuration_unit for z in (wire.start, wire.end))
+    apart, known = jnp.abs(begin - rough).max(), wire.status == int(Status.OK)
     open_there = known & ~jnp.asarray(first) & ~(apart < max(CONTINUITY, digits(apart, 5 / 8)))
-    nowhere = known & ~jnp.asarray(holds) & (table.length < NOWHERE)
+    nowhere = known & ~jnp.asarray(holds) & (wire.length < NOWHERE)
     refused = [int(Status.NO_CONVERGENCE), int(Status.LEFT_FORMATION)]
-    return jnp.select([open_there, nowhere], refused, table.status)
+    status = jnp.select([open_there, nowhere], refused, wire.status)
+    return _strong((eqx.tree_at(lambda w: w.status, wire, status), begin, end))
+
+
+def _strong(tree):
+    """Without weak types, which depend on how a constant was written: they would make a second program of the next."""
+    return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), tree)
 
 
 def run(

@@ -18,6 +18,7 @@ from wholearm_jax.phase import (
     Outcome,
     Traced,
     destination,
+    follow,
     prepare,
     run,
     run_blank,
@@ -30,8 +31,9 @@ from wholearm_jax.scene import Phase, Scene, body
 from wholearm_jax.schedule import Torque, has_steps, padded, rounded
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration, tolerance_as_data, with_room
+from wholearm_jax.system import system
 from wholearm_jax.verdict import ARRIVAL, GOALS
-from wholearm_jax.wire import Resolution
+from wholearm_jax.wire import Resolution, Wire
 
 ROUNDING = 1e4  # of a precision's last digit, the interpolation error that more panels do not make smaller
 
@@ -76,8 +78,25 @@ def traced_together(scene: Scene, resolution: Resolution) -> Traced:
         traced = prepare(solid, scene.hand, scene.gravity, formation, rough, heading, resolution, first, holds)
         return (jnp.where(holds, traced.begin, traced.end), jnp.asarray(False)), traced
 
-    told = stacked([(p.formation, p.heading, jnp.asarray(p.arrive == "hold")) for p in scene.phases])
-    return jax.lax.scan(one, (scene.start, jnp.asarray(True)), told)[1]
+    return jax.lax.scan(one, (scene.start, jnp.asarray(True)), _traced_told(scene))[1]
+
+
+def wires_together(scene: Scene, resolution: Resolution) -> Wire:
+    """The wires alone: `Wire` with an axis of phases."""
+    solid = body(scene.object)
+
+    def one(at, phase):
+        (rough, first), (formation, heading, holds) = at, phase
+        mechanics = system(solid, scene.hand, scene.gravity, formation)
+        wire, begin, end = follow(mechanics, rough, heading, resolution, first, holds)
+        return (jnp.where(holds, begin, end), jnp.asarray(False)), wire
+
+    return jax.lax.scan(one, (scene.start, jnp.asarray(True)), _traced_told(scene))[1]
+
+
+def _traced_told(scene: Scene):
+    """What a plan says of its phases' wires, with an axis of phases: formation, heading, and whether it only holds."""
+    return stacked([(p.formation, p.heading, jnp.asarray(p.arrive == "hold")) for p in scene.phases])
 
 
 def stacked(several):

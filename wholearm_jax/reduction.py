@@ -262,7 +262,7 @@ def _fitted(columns: dict[str, Float[Array, "panels nodes *shape"]]) -> tuple[di
     to_powers, to_last = _transforms(every.shape[1])
     ends = np.cumsum([math.prod(c.shape[2:]) for c in columns.values()])[:-1]
     powers, lasts = (
-        jnp.split(jax.vmap(times, (None, 0))(jnp.asarray(matrix), values), ends, axis=2)
+        jnp.split(jnp.asarray(matrix) @ values, ends, axis=2)
         for matrix, values in ((to_powers, every), (to_last, stop_gradient(every)))
     )
     fitted = {name: each.reshape(c.shape) for (name, c), each in zip(columns.items(), powers, strict=True)}

@@ -19,19 +19,17 @@ from wholearm_jax.motion import Motion
 from wholearm_jax.phase import Outcome
 from wholearm_jax.reduction import Table, balance, on_panel, powers
 from wholearm_jax.result import BRIEF
-from wholearm_jax.scene import Formation, Scene, body
 from wholearm_jax.schedule import ROUNDING, Torque, Window, torque_in, window
-from wholearm_jax.system import System, system
+from wholearm_jax.system import System
 
 
-def surely_held(scene: Scene, formation: Formation, table: Table, schedule: Torque, done: Outcome) -> Bool[Array, ""]:
+def surely_held(mechanics: System, table: Table, schedule: Torque, done: Outcome) -> Bool[Array, ""]:
     """Whether every time that friction holds the object at rest in a phase is proved to be possible."""
     motion = done.motion
     rows = jnp.arange(motion.held.shape[0])
     rests = motion.held & (rows < motion.count) & (jnp.diff(motion.share) > BRIEF)
 
     def all_proved():
-        mechanics = system(body(scene.object), scene.hand, scene.gravity, formation)
         seen = window(schedule, done.start, done.duration)
 
         def next_rest(at):

@@ -29,10 +29,11 @@ from wholearm_jax.plan import outcomes, require_covered, require_motion, roomy, 
 from wholearm_jax.programs import Program
 from wholearm_jax.requirements import require_positive
 from wholearm_jax.resting import surely_held
-from wholearm_jax.scene import Scene
+from wholearm_jax.scene import Scene, body
 from wholearm_jax.schedule import Torque, beyond, padded
 from wholearm_jax.status import Status
 from wholearm_jax.stepping import Integration
+from wholearm_jax.system import system
 from wholearm_jax.variation import Ensemble
 from wholearm_jax.verdict import BRAKING
 from wholearm_jax.wire import Resolution
@@ -187,8 +188,9 @@ def _rests_proved(sample: _Sampled, torque: Torque, found: tuple[Outcome, ...]) 
     """Whether it is proved that friction can keep the object wherever it rests."""
     scene, traced = sample
     fixed = jax.lax.stop_gradient(found)
-    rows = zip(scene.phases, traced, fixed, strict=True)
-    return jnp.stack([surely_held(scene, p.formation, t.table, padded(torque), o) for p, t, o in rows]).all()
+    solid, rows = body(scene.object), zip(scene.phases, traced, fixed, strict=True)
+    each = [(system(solid, scene.hand, scene.gravity, p.formation), t.table, o) for p, t, o in rows]
+    return jnp.stack([surely_held(mechanics, table, padded(torque), o) for mechanics, table, o in each]).all()
 
 
 def _missed(outcome, table, arrive: str, arrival):

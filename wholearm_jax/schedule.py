@@ -119,8 +119,8 @@ def window(schedule: Torque, start: Float[Array, ""], duration: Float[Array, ""]
     slope = jnp.where((gap > 0)[:, None], rise / jnp.where(gap > 0, gap, 1.0)[:, None], 0.0) * duration
     intervals = times.shape[0] - 1
     near = ROUNDING * jnp.finfo(times.dtype).eps * (jnp.abs(start) + duration)
-    first = jnp.searchsorted(times, start + near, side="right") - 1
-    last = jnp.searchsorted(times, start + duration - near, side="left") - 1
+    first = (times <= start + near).sum() - 1
+    last = (times < start + duration - near).sum() - 1
     first = jnp.clip(first, 0, intervals - 1)
     return Window(
         share=(times - start) / duration,

@@ -26,7 +26,7 @@ from wholearm_jax.contacts import constraint_rows, constraints, placed
 from wholearm_jax.elimination import times
 from wholearm_jax.march import correct, march, signs_of, speeds_of
 from wholearm_jax.places import coordinate, places_of
-from wholearm_jax.precision import digits
+from wholearm_jax.precision import array, digits
 from wholearm_jax.scene import Heading
 from wholearm_jax.start import dependent, leading, misplaced, oriented, project
 from wholearm_jax.status import Status
@@ -134,6 +134,20 @@ def trace_wire(system: System, rough: Float[Array, "5"], heading: Heading, resol
     return eqx.tree_at(lambda w: w.status, wire, worst)
 
 
+def blank(resolution: Resolution, contacts: int = 4) -> Wire:
+    """A wire of the right shapes that was not found: something to compile with."""
+    pieces, panels, nodes, _ = resolution
+    each = {name: np.zeros((pieces, 5)) for name in ("chart", "anchor")}
+    each |= {name: np.zeros(pieces) for name in ("anchor_s", "factor")} | {
+        name: np.zeros(5) for name in ("start", "end")
+    }
+    each |= {"slip_sign": np.zeros((pieces, contacts)), "joint_sign": np.zeros((pieces, 2))}
+    each |= {"breaks": np.arange(pieces + 1.0), "nodes": np.zeros((panels, nodes, 5))}
+    each |= {"first": np.zeros(pieces, int), "panels": np.ones(pieces, int), "owner": np.zeros(panels, int)}
+    each |= {"count": 1, "status": int(Status.NO_CONVERGENCE), "end_why": NO_END, "end_contact": 0}
+    return Wire(**{name: array(value) for name, value in each.items()})
+
+
 def chebyshev(nodes: int) -> np.ndarray:
     """Chebyshev points of the first kind on [-1, 1], increasing."""
     return -np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)
@@ -229,14 +243,14 @@ def _panels(breaks, count, resolution):
     # What rounding leaves over goes to the last piece that is used.
     panels = panels.at[count - 1].add(resolution.panels - panels.sum())
     first = jnp.concatenate([jnp.zeros(1, int), jnp.cumsum(panels)[:-1]])
-    owner = jnp.searchsorted(jnp.cumsum(panels), jnp.arange(resolution.panels), side="right")
+    owner = (jnp.arange(resolution.panels)[:, None] >= jnp.cumsum(panels)).sum(1)
     return first, panels, owner
 
 
 def _interpolate(marched, s, u):
     """Cubic Hermite guess of `z` at every `s` from the march's nodes."""
     nodes = marched.nodes
-    right = jnp.clip(jnp.searchsorted(nodes.s, s), 1, jnp.maximum(marched.n - 1, 1))
+    right = jnp.clip((nodes.s < s[..., None]).sum(-1), 1, jnp.maximum(marched.n - 1, 1))
     left = right - 1
     width = nodes.s[right] - nodes.s[left]
     width = jnp.where(jnp.isfinite(width) & (width > 0), width, 1.0)[..., None]
@@ -251,21 +265,18 @@ def _interpolate(marched, s, u):
     )
 
 
-def _decided(known, sign):
-    """A sign, or the one known from next to it where it is undecided."""
-    return jnp.where(sign != 0, sign, known)
-
-
 def _signs(values, owner, resolution):
     """Signs of slips and joint speeds of each piece, and whether any node contradicts its piece's sign.
 
     What is smooth and zero throughout a piece is zero on the whole wire. Where only a piece is too short to tell, as
     between kinks that meet, what it adjoins holds: the piece before it, or behind it at the start.
     """
-    total = jax.ops.segment_sum(values.sum(1), owner, resolution.pieces)
-    tolerance = digits(values, 5 / 8)
+    tolerance, piece = digits(values, 5 / 8), jnp.arange(resolution.pieces)
+    total = jnp.where((owner == piece[:, None])[..., None], values.sum(1), 0.0).sum(1)
     signs = signs_of(total, tolerance)
-    signs = jax.lax.associative_scan(_decided, signs)
-    signs = jax.lax.associative_scan(_decided, signs, reverse=True)
+    away = piece[:, None] - piece
+    away = jnp.where(away >= 0, away, resolution.pieces - away)
+    told_by = jnp.argmin(jnp.where(signs != 0, away[..., None], 2 * resolution.pieces), axis=1)
+    signs = jnp.take_along_axis(signs, told_by, axis=0)
     missed = jnp.any(values * signs[owner][:, None] < -tolerance) | ~jnp.all(jnp.isfinite(values))
     return signs[:, :4], signs[:, 4:], missed
