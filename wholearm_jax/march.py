@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.contacts import constraint_rows, constraints, slips
-from wholearm_jax.elimination import inverse, times
+from wholearm_jax.elimination import crossed, inverse, times
 from wholearm_jax.lookup import put
 from wholearm_jax.precision import digits
 from wholearm_jax.scene import Heading
@@ -29,14 +29,11 @@ CHARTS = 8  # directions that a wire may be charted by, one after the other
 
 
 def oriented_tangent(system: System, z, hint):
-    """The unit tangent `x` and `det [G; x]`: the product of singular values, which changes sign where wires meet."""
-    return _normalised(*inverse(jnp.concatenate([constraint_rows(system.contacts, z), hint[None]])))
-
-
-def _normalised(inverted, determinant):
-    """The same of `[G; hint]^-1` and its determinant."""
-    size = jnp.sqrt((inverted[:, 4] ** 2).sum())
-    return inverted[:, 4] / size, determinant * size  # hint = x / size + what the rows of G span
+    """The unit tangent `x` on the side of `hint`, and `det [G; x]`: the product of singular values, which changes sign
+    where wires meet."""
+    across = crossed(constraint_rows(system.contacts, z))
+    size = jnp.sqrt((across**2).sum()) * jnp.where(across @ hint < 0, -1.0, 1.0)
+    return across / size, size
 
 
 def speeds_of(system: System, z, x):
@@ -162,7 +159,8 @@ def _step(system: System, watch: Watch, tolerance, capacity: int, way: _Way) -> 
     last, u = way.last, way.chart.direction
     height = u @ last.z + way.step
     z, moved, inverted, determinant = correct(system, u, _predicted(way), height, 4, tolerance)
-    x, orientation = _normalised(inverted, determinant)
+    size = jnp.sqrt((inverted[:, 4] ** 2).sum())
+    x, orientation = inverted[:, 4] / size, determinant * size  # u = x / size + what the rows of G span
     watched = watch.at(z, x / (u @ x))
     good = (moved < tolerance) & (x @ last.x > 0.98) & jnp.all(jnp.isfinite(x))
     crossed, where = crossings(watch, way.before, watched, way.step, tolerance)

@@ -48,16 +48,22 @@ def places_of(system, heading, marched: March, most: int) -> Places:
     # A chart ends at the node before the first step in the next one.
     chart = marched.nodes.chart[jnp.maximum(segment - (what == _PLANE), 0)]
 
-    def locate(segment, what, guess, chart):
+    def locate(row):
+        used, segment, what, guess, chart = row
         hint = pick(marched.nodes.x, jnp.maximum(segment - 1, 0))
 
         def vanishing(system, z, x, heading):
             return _vanishing(system, heading, marched, z, x, hint @ (z - guess))[what]
 
-        root = newton(vanishing, system, guess, hint, heading)
-        return root.z, root.x, root.residual, coordinate(marched, chart, root.z)
+        def sharp():
+            root = newton(vanishing, system, guess, hint, heading)
+            return root.z, root.x, root.residual, coordinate(marched, chart, root.z)
 
-    z, x, residual, s = jax.vmap(locate)(segment, what, guess, chart)
+        none = jnp.zeros_like(guess[0])
+        return jax.lax.cond(used, sharp, lambda: (guess, hint, none, none))
+
+    # One after the other: most wires have few.
+    z, x, residual, s = jax.lax.map(locate, (used, segment, what, guess, chart))
     slack = jnp.where(what == _END, 4 * SHORTEST, digits(z, 3 / 8))
     before = jnp.where(segment > 0, marched.nodes.s[jnp.maximum(segment - 1, 0)], 0.0)
     astray = (residual > digits(z, 1 / 2)) | (s < before - slack) | (s > marched.nodes.s[segment] + slack)

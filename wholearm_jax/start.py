@@ -9,7 +9,7 @@ import numpy as np
 from jax.lax import stop_gradient
 
 from wholearm_jax.contacts import GROUPS, PALM_END, ROOT, constraint_rows, constraints, frames
-from wholearm_jax.elimination import inverse, solve, times
+from wholearm_jax.elimination import crossed, solve, times
 from wholearm_jax.march import oriented_tangent
 from wholearm_jax.newton import newton
 from wholearm_jax.precision import digits
@@ -30,7 +30,8 @@ def project(system, rough):
         return z + move * jnp.minimum(1.0, 0.3 / jnp.maximum(jnp.abs(move).max(), 1e-30))
 
     z = jax.lax.fori_loop(0, 12, lambda _, z: least(z), far)
-    root = newton(lambda system, z, x, rough: x @ (z - rough), system, z, _null(fixed, z), rough)
+    tangent, _ = oriented_tangent(fixed, z, far)  # of either sense
+    root = newton(lambda system, z, x, rough: x @ (z - rough), system, z, tangent, rough)
     near = jnp.where(root.residual < digits(z, 3 / 8), root.z, z)
     fixed_near = stop_gradient(near)
     along, _ = oriented_tangent(fixed, fixed_near, stop_gradient(root.x))
@@ -97,16 +98,7 @@ def dependent(system, z):
     """Whether the constraints depend on one another at `z`: their rows span no volume."""
     rows = constraint_rows(system.contacts, z)
     rows = rows / jnp.sqrt((rows**2).sum(1, keepdims=True))
-    return inverse(times(rows, rows.T))[1] < digits(z, 3 / 4)
-
-
-def _null(system, z):
-    """About the unit tangent at `z`, of either sense: the longest column of the projector onto what is orthogonal to
-    `G`, which has half of the digits where rows are nearly dependent."""
-    rows = constraint_rows(system.contacts, z)
-    projector = jnp.eye(5, dtype=z.dtype) - times(rows.T, solve(times(rows, rows.T), rows))
-    longest = projector[jnp.argmax(jnp.diag(projector))]
-    return longest / jnp.sqrt((longest**2).sum())
+    return (crossed(rows) ** 2).sum() < digits(z, 3 / 4)
 
 
 def oriented(along, heading):
