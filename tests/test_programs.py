@@ -1,5 +1,6 @@
 """Kept programs: read instead of traced, equal to traced ones, never mistaken for others, never in the way."""
 
+import gc
 import threading
 
 import equinox as eqx
@@ -180,3 +181,21 @@ def test_who_waits_is_told_what_was_raised_and_may_try_again():
     programs.wait(programs.beside(interrupted))
     programs.wait(programs.beside(interrupted))
     assert len(tries) == 2
+
+
+@pytest.mark.parametrize("collects", [True, False])
+def test_the_collector_rests_while_a_program_is_traced_and_is_then_what_it_was(collects):
+    seen = []
+
+    def traced(x):
+        seen.append(gc.isenabled())
+        return x + 1
+
+    was = gc.isenabled()
+    try:
+        (gc.enable if collects else gc.disable)()
+        programs.Program(traced)(np.ones(3))
+        assert seen == [False]
+        assert gc.isenabled() is collects
+    finally:
+        (gc.enable if was else gc.disable)()

@@ -12,6 +12,7 @@ compiled `beside`, as soon as the first program has been traced.
 
 import contextlib
 import functools
+import gc
 import hashlib
 import os
 import pickle
@@ -68,7 +69,8 @@ class Program:
             kept = self._kept(folder, arrays, tree, settings) if folder else None
             call = jax.jit(self._of_arrays(tree, settings))
             if not (within or kept):
-                call.trace(*arrays).lower()  # all that needs Python: calling it compiles it
+                with _uncollected():
+                    call.trace(*arrays).lower()  # all that needs Python: calling it compiles it
             if not within:
                 _start()
             call = self._calls[key] = _compiled(*kept) if kept else call
@@ -120,7 +122,20 @@ class Program:
 
         flat.__name__ = self._name
         abstract = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in arrays]
-        return export.export(jax.jit(flat))(*abstract), shape
+        with _uncollected():
+            return export.export(jax.jit(flat))(*abstract), shape
+
+
+@contextlib.contextmanager
+def _uncollected():
+    """Without Python's collector of cycles, which would go through all that tracing has made so far again and again."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 class Beside:
