@@ -4,14 +4,14 @@ r"""Many scenes: how many a second one schedule is checked against, and what lim
 
 The heptagon's whole plan (two phases, 2 s), every wire traced anew, vertices within 0.2 mm and friction within 10 %, in
 one process with a device for each processor: checks over the size of the batch, on one device as well, beside what two
-gain for arithmetic alone; checks of objects that differ in friction and mass alone; checks with the gradient of the
-margin with respect to all torques, optimisations, one process against two, the largest difference of a margin from the
-full resolution, compile times (the first call's, nothing kept; compiled quickly and well) and peak memory. Beside them
-MuJoCo's rollouts of the same plan with the same scenes on all threads, at the longest of some time steps whose object
-ends within 1 % of its way from the prediction (`pose`), and at the longest whose least force is within 1 % of the
-predicted one, or else the shortest (`margin`; phases are of equal length, and twentieths of a phase at its ends are
-left out, where soft contacts take over); and the same with Coulomb's friction (`execution`), at the longest step whose
-least force is.
+gain for arithmetic alone; checks of the first phase alone (1 s); checks of objects that differ in friction and mass
+alone; checks with the gradient of the margin with respect to all torques, optimisations, one process against two, the
+largest difference of a margin from the full resolution, compile times (the first call's, nothing kept; compiled quickly
+and well) and peak memory. Beside them MuJoCo's rollouts of the same plan with the same scenes on all threads, at the
+longest of some time steps whose object ends within 1 % of its way from the prediction (`pose`), and at the longest
+whose least force is within 1 % of the predicted one, or else the shortest (`margin`; phases are of equal length, and
+twentieths of a phase at its ends are left out, where soft contacts take over); and the same with Coulomb's friction
+(`execution`), at the longest step whose least force is.
 """
 
 import argparse
@@ -111,6 +111,18 @@ def same_geometry(torque) -> dict:
     rate = ALIKE / (time.perf_counter() - begun)
     print(f"friction and mass alone: {rate:.0f} a second, {memory():.0f} MiB", flush=True)
     return {"count": ALIKE, "rate": rate, "memory": memory()}
+
+
+def one_phase(torque) -> dict:
+    """Checks of the first phase alone, a second of motion."""
+    scene = wa.load("heptagon")
+    ensemble = vary(replace(scene, phases=scene.phases[:1]), VARIED, seed=1)
+    wa.check(ensemble, torque, count=BLOCK, arrival=ARRIVAL)
+    begun = time.perf_counter()
+    wa.check(ensemble, torque, count=ALIKE, arrival=ARRIVAL)
+    rate = ALIKE / (time.perf_counter() - begun)
+    print(f"one phase: {rate:.0f} a second", flush=True)
+    return {"count": ALIKE, "rate": rate}
 
 
 def gradients(ensemble, torque) -> dict:
@@ -332,6 +344,7 @@ def main() -> None:
         "compiled": compiling,
         "scaling": lambda: scaling(ensemble, torque),
         "same_geometry": lambda: same_geometry(torque),
+        "one_phase": lambda: one_phase(torque),
         "mujoco": lambda: rollouts(ensemble, torque),
         "coulomb": lambda: by_coulomb(ensemble, torque),
         "gradient": lambda: gradients(ensemble, torque),

@@ -13,7 +13,7 @@ from wholearm_jax.reduction import combined, on_panel, powers
 from wholearm_jax.scene import body
 from wholearm_jax.scene_file import to_dict
 from wholearm_jax.system import system
-from wholearm_jax.wire import Resolution
+from wholearm_jax.wire import Resolution, _panels
 
 ENDS = {
     "heptagon": ("finger2:v4 is made", "palm:v0 is made"),
@@ -245,6 +245,20 @@ def traced_with(scene, phase, panels):
     told, rough = scene.phases[phase], scene.start if phase == 0 else wa.trace(scene)[0].end
     resolution = Resolution(panels=panels)
     return prepare(body(scene.object), scene.hand, scene.gravity, told.formation, rough, told.heading, resolution).table
+
+
+@pytest.mark.parametrize(
+    ("lengths", "panels"), [([2.0, 0.01], [3, 1]), ([0.01, 2.0], [1, 3]), ([0.01, 2.0, 0.01], [1, 2, 1]), ([1.0], [4])]
+)
+def test_panels_go_where_the_wire_is_long(lengths, panels):
+    """At least one to each piece that is used; what rounding leaves over goes to the longest."""
+    pieces, count = 4, len(lengths)
+    breaks = jnp.pad(jnp.cumsum(jnp.asarray([0.0, *lengths])), (0, pieces - count), mode="edge")
+    first, shared, owner = _panels(breaks, count, Resolution(pieces, panels=4))
+    assert shared[:count].tolist() == panels
+    assert shared[count:].tolist() == [0] * (pieces - count)
+    assert first[:count].tolist() == np.cumsum([0, *panels])[:-1].tolist()
+    assert owner.tolist() == np.repeat(np.arange(count), panels).tolist()
 
 
 def test_tables_are_refined_until_they_are_good_enough_or_refused():

@@ -79,7 +79,7 @@ class Level(NamedTuple):
     error: float
 
 
-QUICK = Level(Resolution(4, 8, 8, 64), Integration(tolerance=1e-8, max_steps=96, stages=4), 5e-7)
+QUICK = Level(Resolution(4, 7, 8, 64), Integration(tolerance=1e-8, max_steps=96, stages=4), 5e-7)
 FULL = Level(Resolution(), Integration(), 1e-9)
 
 

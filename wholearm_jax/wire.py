@@ -240,8 +240,8 @@ def _panels(breaks, count, resolution):
     spare = resolution.panels - count
     share = jnp.floor(spare * jnp.where(live, lengths, 0.0) / jnp.maximum(lengths.sum(), 1e-30)).astype(int)
     panels = jnp.where(live, 1 + share, 0)
-    # What rounding leaves over goes to the last piece that is used.
-    panels = panels.at[count - 1].add(resolution.panels - panels.sum())
+    longest = jnp.arange(resolution.pieces) == jnp.argmax(lengths)
+    panels = panels + jnp.where(longest, resolution.panels - panels.sum(), 0)  # what rounding leaves over
     first = jnp.concatenate([jnp.zeros(1, int), jnp.cumsum(panels)[:-1]])
     owner = (jnp.arange(resolution.panels)[:, None] >= jnp.cumsum(panels)).sum(1)
     return first, panels, owner
