@@ -13,9 +13,19 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax import batch_command, command
 from wholearm_jax import survey as survey_module
-from wholearm_jax.batch import ALONE, GOOD, QUICK, Checked, check_chunks, check_scene, from_result
+from wholearm_jax.batch import (
+    ALONE,
+    GOOD,
+    QUICK,
+    Checked,
+    _checks_of,
+    _wires_of,
+    check_chunks,
+    check_scene,
+    from_result,
+)
 from wholearm_jax.outline import first_flaw
-from wholearm_jax.plan import traced_together
+from wholearm_jax.plan import wires_together
 from wholearm_jax.polygon_file import how_many, read_polygons
 from wholearm_jax.scene_file import SceneError, to_dict
 from wholearm_jax.schedule import Torque, padded
@@ -78,7 +88,7 @@ def test_margins_are_right_to_what_is_said_by_default(ensemble, schedule, checke
     assert np.any(quick.margin != checked.margin), "it is no test of another level"
 
 
-def test_scenes_with_the_same_wires_side_by_side_are_what_they_are_alone(scene, schedule):
+def test_scenes_with_the_same_wires_are_what_they_are_alone(scene, schedule):
     loose = vary(scene, {"friction": "10%", "mass": "5%"}, seed=SEED)
     assert loose.same_wires
     checked = wa.check(loose, schedule, count=2, arrival=ARRIVAL, tolerance=1e-10)
@@ -429,16 +439,25 @@ def test_an_object_waits_only_where_some_forces_hold_it(scene, schedule, ways):
 
 
 def test_scenes_that_share_their_geometry_share_their_wires(scene):
-    """All phases are traced once, whatever friction and mass: else `vmap` could not give one of them for all."""
+    """All phases are traced once, whatever friction and mass: `vmap` would not give out one of them for all else."""
 
     def wires(friction, mass):
         where = (lambda s: s.object.friction), (lambda s: s.object.mass)
         changed = scene
         for at, value in zip(where, (friction, mass), strict=True):
             changed = eqx.tree_at(at, changed, value)
-        table = traced_together(changed, QUICK.resolution).table
-        return table.breaks, table.configuration, table.velocity
+        return wires_together(changed, QUICK.resolution)
 
     frictions, masses = jnp.full((2, 3), 0.1) * jnp.array([[1.0], [1.5]]), jnp.array([0.2, 0.3])
-    breaks, *_ = jax.eval_shape(jax.vmap(wires, out_axes=None), frictions, masses)
-    assert breaks.shape == (len(scene.phases), QUICK.resolution.pieces + 1)
+    shared = jax.eval_shape(jax.vmap(wires, out_axes=None), frictions, masses)
+    assert shared.breaks.shape == (len(scene.phases), QUICK.resolution.pieces + 1)
+
+
+def test_scenes_side_by_side_as_on_a_gpu_are_what_they_are_one_after_the_other(ensemble, schedule):
+    numbers, found = jnp.arange(3), []
+    level = QUICK._replace(how=replace(QUICK.how, steps=True))
+    for side_by_side in (False, True):
+        wires = _wires_of((ensemble, level.resolution, side_by_side), numbers)
+        found.append(_checks_of((ensemble, padded(schedule), ARRIVAL, level, side_by_side), numbers, wires))
+    for one, other in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9)
