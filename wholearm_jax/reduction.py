@@ -261,6 +261,7 @@ def _fitted(columns: dict[str, Float[Array, "panels nodes *shape"]]) -> tuple[di
     every = jnp.concatenate([c.reshape(*c.shape[:2], -1) for c in columns.values()], axis=2)
     to_powers, to_last = _transforms(every.shape[1])
     ends = np.cumsum([math.prod(c.shape[2:]) for c in columns.values()])[:-1]
+    # A product that is left to a library keeps a loop over phases in pieces: whole, it takes twice as long to compile.
     powers, lasts = (
         jnp.split(jnp.asarray(matrix) @ values, ends, axis=2)
         for matrix, values in ((to_powers, every), (to_last, stop_gradient(every)))
