@@ -25,7 +25,7 @@ from wholearm_jax.batch import (
     from_result,
 )
 from wholearm_jax.outline import first_flaw
-from wholearm_jax.plan import wires_together
+from wholearm_jax.plan import steps_within, wires_together
 from wholearm_jax.polygon_file import how_many, read_polygons
 from wholearm_jax.scene_file import SceneError, to_dict
 from wholearm_jax.schedule import Torque, padded
@@ -454,10 +454,10 @@ def test_scenes_that_share_their_geometry_share_their_wires(scene):
 
 
 def test_scenes_side_by_side_as_on_a_gpu_are_what_they_are_one_after_the_other(ensemble, schedule):
-    numbers, found = jnp.arange(3), []
-    level = QUICK._replace(how=replace(QUICK.how, steps=True))
-    for side_by_side in (False, True):
-        wires = _wires_of((ensemble, level.resolution, side_by_side), numbers)
-        found.append(_checks_of((ensemble, padded(schedule), ARRIVAL, level, side_by_side), numbers, wires))
-    for one, other in zip(*map(jax.tree.leaves, found), strict=True):
-        np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9)
+    numbers, level = jnp.arange(3), QUICK._replace(how=replace(QUICK.how, steps=steps_within(ensemble.scene, schedule)))
+    wires = _wires_of((ensemble, level.resolution, True), numbers)
+    found, grade = _checks_of((ensemble, padded(schedule), ARRIVAL, level, True), numbers, wires)
+    assert grade.tolist() == [GOOD] * len(numbers)
+    one_by_one = wa.check(ensemble, schedule, count=len(numbers), arrival=ARRIVAL)
+    for each, other in zip(found, one_by_one, strict=True):
+        np.testing.assert_allclose(each, other, rtol=1e-9, atol=1e-9)
