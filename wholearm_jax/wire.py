@@ -138,9 +138,8 @@ def blank(resolution: Resolution, contacts: int = 4) -> Wire:
     """A wire of the right shapes that was not found: something to compile with."""
     pieces, panels, nodes, _ = resolution
     each = {name: np.zeros((pieces, 5)) for name in ("chart", "anchor")}
-    each |= {name: np.zeros(pieces) for name in ("anchor_s", "factor")} | {
-        name: np.zeros(5) for name in ("start", "end")
-    }
+    each |= {name: np.zeros(pieces) for name in ("anchor_s", "factor")}
+    each |= {name: np.zeros(5) for name in ("start", "end")}
     each |= {"slip_sign": np.zeros((pieces, contacts)), "joint_sign": np.zeros((pieces, 2))}
     each |= {"breaks": np.arange(pieces + 1.0), "nodes": np.zeros((panels, nodes, 5))}
     each |= {"first": np.zeros(pieces, int), "panels": np.ones(pieces, int), "owner": np.zeros(panels, int)}
