@@ -32,9 +32,9 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 import wholearm_jax as wa
-from wholearm_jax.batch import BLOCK, QUICK, check_scene
-from wholearm_jax.schedule import Torque, padded
-from wholearm_jax.variation import vary
+from wholearm_jax.ensembles.batch import BLOCK, QUICK, check_scene
+from wholearm_jax.ensembles.ensemble import vary
+from wholearm_jax.model.schedule import Torque, padded
 
 HERE = Path(__file__).parent
 COUNTS = (128, 1024, 8192, 65_536, 1_000_000)
@@ -177,8 +177,8 @@ def margin_error(done) -> float:
 
 def laid_in(ensemble, torque):
     """The plan's prediction, and scenes of the ensemble with where each object lies in the hand."""
-    from wholearm_jax.execution import start_of
-    from wholearm_jax.perturbation import start_near
+    from wholearm_jax.execution.rollout import start_of
+    from wholearm_jax.execution.trials import start_near
 
     prediction = wa.simulate(ensemble.scene, torque)
     scenes = [ensemble.draw(np.asarray(number)) for number in range(ROLLOUTS)]
@@ -199,8 +199,8 @@ def roll_out(models, starts, torques) -> None:
 
 def rollouts(ensemble, torque) -> dict:
     """MuJoCo, its own friction, all threads: rates at the longest time step that still ends near the prediction."""
-    from wholearm_jax.execution import clock, execute, motor_torques
-    from wholearm_jax.free_bodies import CONVEX, free_bodies
+    from wholearm_jax.execution.mujoco_model import CONVEX, free_bodies
+    from wholearm_jax.execution.rollout import clock, execute, motor_torques
 
     prediction, scenes, starts = laid_in(ensemble, torque)
     course = np.concatenate([np.asarray(t.z) for t in wa.trajectory(prediction)])
@@ -226,9 +226,9 @@ def rollouts(ensemble, torque) -> dict:
 
 def by_coulomb(ensemble, torque) -> dict:
     """Free bodies with Coulomb's friction, all processors: the rate at the longest step with right margins."""
-    from wholearm_jax.execution import clock, execute, motor_torques
-    from wholearm_jax.free_bodies import free_bodies
-    from wholearm_jax.perturbation import roll_out as driven
+    from wholearm_jax.execution.mujoco_model import free_bodies
+    from wholearm_jax.execution.rollout import clock, execute, motor_torques
+    from wholearm_jax.execution.trials import roll_out as driven
 
     prediction, scenes, starts = laid_in(ensemble, torque)
     steps = [step for step in STEPS if step >= FINEST]
@@ -251,7 +251,7 @@ def processes(number: int, folder: Path, torque: Path, count: int, chunk: int) -
     """The rate of a store's growth by `number` processes, after each has written its first chunk."""
     out = folder / f"{number}.zarr"
     varied = [f"--vary={name}={amount}" for name, amount in VARIED.items()]
-    line = [sys.executable, "-c", "from wholearm_jax.command import main; main()", "check", "heptagon"]
+    line = [sys.executable, "-c", "from wholearm_jax.cli.app import main; main()", "check", "heptagon"]
     line += ["--torque", str(torque), *varied, "--count", str(count), "--chunk", str(chunk), "--out", str(out)]
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder / "programs"), "MPLBACKEND": "agg"}
     joined = ["--coordinator", "127.0.0.1:47113", "--processes", str(number), "--process"]

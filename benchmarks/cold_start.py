@@ -36,7 +36,7 @@ APART = """
 import json, sys, time
 begun = time.perf_counter()
 import jax
-from wholearm_jax.command import main
+from wholearm_jax.cli.app import main
 import wholearm_jax
 spent = {"import": time.perf_counter() - begun}
 names = {
@@ -70,7 +70,7 @@ def environment(cache: Path, flags: str = "") -> dict[str, str]:
 def run(arguments, cache: Path, out: Path, flags: str = "") -> dict[str, float]:
     """Wall times [s] of one process: to the first line that it prints, which is the first phase's, and to its exit."""
     begun = time.perf_counter()
-    command = [sys.executable, "-u", "-m", "wholearm_jax.command", *arguments, "--out", str(out)]
+    command = [sys.executable, "-u", "-m", "wholearm_jax", *arguments, "--out", str(out)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, env=environment(cache, flags), **pipes) as process:
         process.stdout.readline()

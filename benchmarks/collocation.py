@@ -9,7 +9,7 @@ is a share `u` of `T`, place a share `p` of the wire's length `L`, and `w = dp/d
     maximise m   subject to   dp/du = w,   dw/du = (T^2/L) (A0 + A3 tau1 + A4 tau2) + T A2 w + L A1 w^2,
                               F0 + F1 (L w/T)^2 + F2 (L w/T) + F3 tau1 + F4 tau2 >= m,   |tau| <= limit,   w >= 0
 
-with `A` and `F` the coefficients of `wholearm_jax.reduction.Table`. States are cubics on each interval that satisfy the
+with `A` and `F` the coefficients of `wholearm_jax.dynamics.path_dynamics.Table`. States are cubics on each interval that satisfy the
 equation of motion at Radau's three points; forces count at these points and at the start. Each smooth piece of the
 wire enters as one Chebyshev series for every coefficient, refitted from the table to 1e-10, so that IPOPT sees smooth
 functions and exact second derivatives.
@@ -32,11 +32,11 @@ import numpy as np
 from scipy.special import beta, betainc
 
 import wholearm_jax as wa
-from wholearm_jax.phase import run
-from wholearm_jax.reduction import Table
-from wholearm_jax.schedule import padded
-from wholearm_jax.squeeze import holds
-from wholearm_jax.stepping import Integration
+from wholearm_jax.dynamics.path_dynamics import Table
+from wholearm_jax.margin.quasistatic import holds
+from wholearm_jax.model.schedule import padded
+from wholearm_jax.phases.phase import run
+from wholearm_jax.simulation.integrator import Integration
 
 KNOTS, DEGREE = 31, 3
 FINE = 120  # collocation intervals of the best that is known
@@ -113,7 +113,7 @@ class Collocated:
     def nearly(self) -> bool:
         """Whether it would succeed if arriving within a thousandth of the wire, at 5 % of the mean speed, were enough.
 
-        The package itself asks for a millionth of the wire and 0.35 % (`wholearm_jax.verdict`).
+        The package itself asks for a millionth of the wire and 0.35 % (`wholearm_jax.phases.assessment`).
         """
         return self.ipopt in CONVERGED and self.margin > 0 and self.missed < 1e-3 and self.speed < 0.05
 

@@ -15,9 +15,9 @@ import numpy as np
 from measure import RESULTS, save
 
 import wholearm_jax as wa
-from wholearm_jax.execution import execute
-from wholearm_jax.free_bodies import Softness
-from wholearm_jax.palette import LINK_COLOURS as COLOURS
+from wholearm_jax.execution.mujoco_model import Softness
+from wholearm_jax.execution.rollout import execute
+from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
 
 DATA = Path(__file__).parents[1] / "tests" / "data"
 SCENES = ("heptagon", "hexagon")

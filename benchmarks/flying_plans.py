@@ -2,7 +2,7 @@
 
     python benchmarks/flying_plans.py --count 4 --phases 3 --out DIR
 
-From a random grasp (`random_plans`) every admissible formation is followed to its end (`wholearm_jax.formations`),
+From a random grasp (`random_plans`) every admissible formation is followed to its end (`wholearm_jax.planning.successors`),
 and from there every formation whose impact would push, not pull, and pass the speed on. Chains of real length whose
 formations torques can hold are kept.
 """
@@ -18,9 +18,9 @@ import numpy as np
 from random_plans import _grasps, random_object, write
 
 import wholearm_jax as wa
-from wholearm_jax.formations import Way, leaving, ways
-from wholearm_jax.scene import Phase, formation, heading
-from wholearm_jax.scene_file import to_dict
+from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.model.scene import Phase, formation, heading
+from wholearm_jax.planning.successors import Way, leaving, ways
 
 SHORTEST, LEAST_BOUND, SLOWED = 0.2, 0.2, 0.2  # wire [object radii], bound [N], speed after an impact over that before
 

@@ -26,9 +26,9 @@ import measure
 import numpy as np
 
 import wholearm_jax as wa
-from wholearm_jax.forces import score
-from wholearm_jax.motion import move
-from wholearm_jax.schedule import Torque, padded, window
+from wholearm_jax.margin.contact_forces import score
+from wholearm_jax.model.schedule import Torque, padded, window
+from wholearm_jax.simulation.phase_motion import move
 
 HERE = Path(__file__).parent
 KNOTS = (4, 8, 16, 32, 64, 128)

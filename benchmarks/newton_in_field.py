@@ -1,6 +1,6 @@
 r"""The direct way, to compare with: the C-functions are solved by Newton's method inside the vector field.
 
-State `(s, w)` as in `wholearm_jax.motion`; at every stage of every step
+State `(s, w)` as in `wholearm_jax.simulation.phase_motion`; at every stage of every step
 
     C_n(z) = 0,  u . z = s            Newton's method, from the nearest of a few places known on the wire,
     G_n x = 0,  u . x = 1             the wire's tangent, and its derivative x',
@@ -20,12 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.newton import along_wire, newton
-from wholearm_jax.programs import Program
-from wholearm_jax.reduction import Table, balance, on_panel, powers
-from wholearm_jax.schedule import Window, interval, torque_in
-from wholearm_jax.system import System
-from wholearm_jax.wire import Wire
+from wholearm_jax.core.programs import Program
+from wholearm_jax.dynamics.path_dynamics import Table, balance, on_panel, powers
+from wholearm_jax.model.mechanics import System
+from wholearm_jax.model.schedule import Window, interval, torque_in
+from wholearm_jax.tracing.path import Wire
+from wholearm_jax.tracing.path_root import along_wire, newton
 
 PLACES = 33  # known places of the wire: Newton's method starts within a sixty-fourth of its length
 

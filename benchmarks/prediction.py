@@ -46,17 +46,17 @@ from measure import RESULTS, save
 from random_plans import plans as stopping_plans
 
 import wholearm_jax as wa
-from wholearm_jax.execution import Ending, Tolerance, execute, touching
-from wholearm_jax.free_bodies import CONVEX, Softness
-from wholearm_jax.palette import LINK_COLOURS as COLOURS
-from wholearm_jax.phase import destination
-from wholearm_jax.proportion import wilson
-from wholearm_jax.result import Result
-from wholearm_jax.sampling import sample
-from wholearm_jax.scene_file import to_dict
-from wholearm_jax.schedule import padded
-from wholearm_jax.squeeze import coefficients
-from wholearm_jax.status import Status
+from wholearm_jax.core.status import Status
+from wholearm_jax.ensembles.proportion import wilson
+from wholearm_jax.execution.mujoco_model import CONVEX, Softness
+from wholearm_jax.execution.rollout import Ending, Tolerance, execute, touching
+from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.margin.quasistatic import coefficients
+from wholearm_jax.model.schedule import padded
+from wholearm_jax.phases.phase import destination
+from wholearm_jax.phases.result import Result
+from wholearm_jax.phases.sampling import sample
+from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
 
 KNOTS, TIMESTEP = 51, 5e-5  # [s]
 TOLERANCE = Tolerance()

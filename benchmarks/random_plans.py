@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 import wholearm_jax as wa
-from wholearm_jax.phase import ending
-from wholearm_jax.scene_file import to_dict
+from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.phases.phase import ending
 
 VERTICES = (5, 9)  # least and most
 RADIUS = (0.034, 0.048)  # of the circle that the vertices lie in or near [m]

@@ -19,16 +19,16 @@ import numpy as np
 from work_precision import problems
 
 import wholearm_jax as wa
-from wholearm_jax.forces import force, score
-from wholearm_jax.landing import acceleration
-from wholearm_jax.motion import move
-from wholearm_jax.phase import prepare
-from wholearm_jax.reduction import on_panel, powers
-from wholearm_jax.sampling import SAMPLED, sample
-from wholearm_jax.scene import body
-from wholearm_jax.schedule import interval, torque_in
-from wholearm_jax.stepping import Stop, found
-from wholearm_jax.wire import Resolution
+from wholearm_jax.dynamics.path_dynamics import on_panel, powers
+from wholearm_jax.margin.contact_forces import force, score
+from wholearm_jax.model.scene import body
+from wholearm_jax.model.schedule import interval, torque_in
+from wholearm_jax.phases.phase import prepare
+from wholearm_jax.phases.sampling import SAMPLED, sample
+from wholearm_jax.simulation.event_step import acceleration
+from wholearm_jax.simulation.integrator import Stop, found
+from wholearm_jax.simulation.phase_motion import move
+from wholearm_jax.tracing.path import Resolution
 
 COARSE = Resolution(6, 16, 8)
 

@@ -14,17 +14,17 @@ import numpy as np
 from jaxtyping import Array, Float
 from stability_scenes import Scenes
 
-from wholearm_jax.forces import arcs, force, on_arc, score
-from wholearm_jax.landing import acceleration
-from wholearm_jax.motion import move
-from wholearm_jax.reduction import Table, change, on_panel, powers, reduce_wire
-from wholearm_jax.scene import Formation, Hand, Heading, Polygon, body
-from wholearm_jax.schedule import Torque, torque_in, window
-from wholearm_jax.squeeze import holds
-from wholearm_jax.stepping import Integration
-from wholearm_jax.system import configuration_unit, system
-from wholearm_jax.verdict import GOALS, judge
-from wholearm_jax.wire import Resolution, Wire, trace_wire
+from wholearm_jax.dynamics.path_dynamics import Table, change, on_panel, powers, reduce_wire
+from wholearm_jax.margin.contact_forces import arcs, force, on_arc, score
+from wholearm_jax.margin.quasistatic import holds
+from wholearm_jax.model.mechanics import configuration_unit, system
+from wholearm_jax.model.scene import Formation, Hand, Heading, Polygon, body
+from wholearm_jax.model.schedule import Torque, torque_in, window
+from wholearm_jax.phases.assessment import GOALS, judge
+from wholearm_jax.simulation.event_step import acceleration
+from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.phase_motion import move
+from wholearm_jax.tracing.path import Resolution, Wire, trace_wire
 
 PLACES = np.concatenate([[0.0], (np.arange(30) + 0.5) / 30 + 0.01 * np.sin(np.arange(30.0)), [1.0]])
 TIMES = (np.arange(9) + 0.5) / 9

@@ -23,7 +23,7 @@ ROLLS = np.array([[0, 0, 1, 2], [0, 1, 1, 2], [0, 1, 2, 2]])  # which of three c
 
 
 class Scenes(NamedTuple):
-    """A batch of scenes in SI units, one row each; names as in `wholearm_jax.scene`.
+    """A batch of scenes in SI units, one row each; names as in `wholearm_jax.model.scene`.
 
     `uniform` says that the inertia follows from a uniform density; `exact` that `rough` lies within `jitter` of a
     configuration in which all contacts touch. `family` is a row of `FAMILIES`. `torque_kind` and what follows describe

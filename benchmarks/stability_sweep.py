@@ -14,9 +14,9 @@ from stability_model import Model, dot
 from stability_programs import FLOATS, GAUSS, follower, forward, reverse, tracer
 from stability_scenes import Scenes, draw
 
-from wholearm_jax.settings import configure
-from wholearm_jax.stepping import Integration
-from wholearm_jax.wire import Resolution
+from wholearm_jax.core.config import configure
+from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.tracing.path import Resolution
 
 REASONS = (
     "",

@@ -41,17 +41,17 @@ import numba_loop
 import numpy as np
 
 import wholearm_jax as wa
-from wholearm_jax import scene_file
-from wholearm_jax.motion import Motion, move
-from wholearm_jax.phase import Traced, prepare, run
-from wholearm_jax.programs import Program
-from wholearm_jax.reduction import Table
-from wholearm_jax.sampling import sample
-from wholearm_jax.scene import body
-from wholearm_jax.schedule import Torque, Window, padded, window
-from wholearm_jax.status import Status
-from wholearm_jax.stepping import Integration
-from wholearm_jax.system import system
+from wholearm_jax.core.programs import Program
+from wholearm_jax.core.status import Status
+from wholearm_jax.dynamics.path_dynamics import Table
+from wholearm_jax.files import scene_toml as scene_file
+from wholearm_jax.model.mechanics import system
+from wholearm_jax.model.scene import body
+from wholearm_jax.model.schedule import Torque, Window, padded, window
+from wholearm_jax.phases.phase import Traced, prepare, run
+from wholearm_jax.phases.sampling import sample
+from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.phase_motion import Motion, move
 
 HERE = Path(__file__).parent
 PLAIN = (

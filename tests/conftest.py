@@ -6,8 +6,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from wholearm_jax import command
-from wholearm_jax.settings import configure
+from wholearm_jax.cli import app as command
+from wholearm_jax.core.config import configure
 
 MAPPED = 30_000  # half of the memory areas that Linux grants a process by default
 

@@ -10,10 +10,11 @@ import unreduced
 from scipy.optimize import brentq
 
 import wholearm_jax
-from wholearm_jax import scene_file, squeeze
-from wholearm_jax.phase import configuration, run, start_configuration
-from wholearm_jax.sampling import sample
-from wholearm_jax.stepping import Integration
+from wholearm_jax.files import scene_toml as scene_file
+from wholearm_jax.margin import quasistatic as squeeze
+from wholearm_jax.phases.phase import configuration, run, start_configuration
+from wholearm_jax.phases.sampling import sample
+from wholearm_jax.simulation.integrator import Integration
 
 DURATION = 1.0
 

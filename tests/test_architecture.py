@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import wholearm_jax as wa
-from wholearm_jax.phase import _run, prepare
-from wholearm_jax.scene import polygon
+from wholearm_jax.model.scene import polygon
+from wholearm_jax.phases.phase import _run, prepare
 
 PACKAGE = Path(wa.__file__).parent
 ORDER = (

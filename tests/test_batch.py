@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax import batch_command, command
-from wholearm_jax import survey as survey_module
-from wholearm_jax.batch import (
+from wholearm_jax.cli import app as command
+from wholearm_jax.cli import check as batch_command
+from wholearm_jax.core.status import Status
+from wholearm_jax.ensembles import summary as survey_module
+from wholearm_jax.ensembles.batch import (
     ALONE,
     GOOD,
     QUICK,
@@ -24,15 +26,14 @@ from wholearm_jax.batch import (
     check_scene,
     from_result,
 )
-from wholearm_jax.outline import first_flaw
-from wholearm_jax.plan import steps_within, wires_together
-from wholearm_jax.polygon_file import how_many, read_polygons
-from wholearm_jax.scene_file import SceneError, to_dict
-from wholearm_jax.schedule import Torque, padded
-from wholearm_jax.status import Status
-from wholearm_jax.store import StoreError, fingerprint, identity, open_store
-from wholearm_jax.survey import influences, survey
-from wholearm_jax.variation import stack, vary
+from wholearm_jax.ensembles.ensemble import stack, vary
+from wholearm_jax.ensembles.summary import influences, survey
+from wholearm_jax.files.check_store import StoreError, fingerprint, identity, open_store
+from wholearm_jax.files.polygons_npz import how_many, read_polygons
+from wholearm_jax.files.scene_toml import SceneError, to_dict
+from wholearm_jax.model.polygon import first_flaw
+from wholearm_jax.model.schedule import Torque, padded
+from wholearm_jax.phases.plan import steps_within, wires_together
 
 pytest.importorskip("zarr")
 ARRIVAL, SEED, COUNT = 0.02, 3, 6

@@ -13,8 +13,8 @@ import jax
 import numpy as np
 import pytest
 
-from wholearm_jax.batch import Checked
-from wholearm_jax.store import TYPES, StoreError, identity, open_store
+from wholearm_jax.ensembles.batch import Checked
+from wholearm_jax.files.check_store import TYPES, StoreError, identity, open_store
 
 zarr = pytest.importorskip("zarr")
 COUNT, CHUNK, KILLS = 12, 1, 2
@@ -26,7 +26,7 @@ def command():
     torque = Path(__file__).parent / "data" / "heptagon_torque.csv"
     varied = ["--vary", "vertices=0.0002", "--vary", "friction=10%", "--count", str(COUNT), "--chunk", str(CHUNK)]
     settings = ["--seed", "3", "--arrival", "0.02"]
-    run = "from wholearm_jax.command import main; main()"
+    run = "from wholearm_jax.cli.app import main; main()"
     return [sys.executable, "-c", run, "check", "heptagon", "--torque", str(torque), *varied, *settings]
 
 

@@ -31,7 +31,7 @@ def test_random_plans_can_be_followed_and_held():
 def test_random_plans_at_speed_lead_on():
     from flying_plans import chains
 
-    from wholearm_jax.formations import leaving
+    from wholearm_jax.planning.successors import leaving
 
     scene = wa.load("flight")
     traced = wa.trace(scene)

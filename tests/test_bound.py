@@ -10,8 +10,8 @@ import pytest
 from scipy.optimize import linprog
 
 import wholearm_jax as wa
-from wholearm_jax import squeeze
-from wholearm_jax.squeeze import FASTEST, PLACES, SPEEDS
+from wholearm_jax.margin import quasistatic as squeeze
+from wholearm_jax.margin.quasistatic import FASTEST, PLACES, SPEEDS
 
 coefficients, bound, hold = jax.jit(squeeze.coefficients), jax.jit(squeeze.bound), jax.jit(squeeze.hold)
 

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax import plan
-from wholearm_jax.contacts import normal_rows, slip_rows
-from wholearm_jax.optimiser import PASSING
-from wholearm_jax.phase import start_configuration
-from wholearm_jax.reduction import change, on_panel, powers
-from wholearm_jax.scene import body
-from wholearm_jax.scene import heading as wa_heading
-from wholearm_jax.stepping import Integration
-from wholearm_jax.system import system
+from wholearm_jax.dynamics.path_dynamics import change, on_panel, powers
+from wholearm_jax.model.contact_kinematics import normal_rows, slip_rows
+from wholearm_jax.model.mechanics import system
+from wholearm_jax.model.scene import body
+from wholearm_jax.model.scene import heading as wa_heading
+from wholearm_jax.optimisation.optimiser import PASSING
+from wholearm_jax.phases import plan
+from wholearm_jax.phases.phase import start_configuration
+from wholearm_jax.simulation.integrator import Integration
 
 FLIGHTS = ("flight", "passage")
 

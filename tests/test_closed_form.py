@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import wholearm_jax
-from wholearm_jax import squeeze
-from wholearm_jax.reduction import on_panel, powers
+from wholearm_jax.dynamics.path_dynamics import on_panel, powers
+from wholearm_jax.margin import quasistatic as squeeze
 
 W, H, X, MASS, GRAVITY = 0.03, 0.06, 0.08, 0.2, 9.81
 INERTIA = np.array([2e-3, 3e-3])

@@ -8,7 +8,7 @@ import sys
 import pytest
 import tomli_w
 
-from wholearm_jax.scene_file import bundled, load, to_dict
+from wholearm_jax.files.scene_toml import bundled, load, to_dict
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_help_lists_the_commands(wholearm):
 def test_runs_as_a_program(tmp_path):
     environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "true"}
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-m", "wholearm_jax.command", "search", "heptagn"],
+        [sys.executable, "-W", "error", "-m", "wholearm_jax", "search", "heptagn"],
         cwd=tmp_path,
         env=environment,
         capture_output=True,

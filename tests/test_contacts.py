@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.contacts import (
+from wholearm_jax.model.contact_kinematics import (
     along_rates,
     constraint_curvature,
     constraint_rates,
@@ -17,8 +17,8 @@ from wholearm_jax.contacts import (
     slip_rows,
     slips,
 )
-from wholearm_jax.scene import body
-from wholearm_jax.system import system
+from wholearm_jax.model.mechanics import system
+from wholearm_jax.model.scene import body
 
 NEAR = {"rtol": 1e-13, "atol": 1e-13}
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.motion import move
-from wholearm_jax.reduction import blank
-from wholearm_jax.schedule import padded, window
-from wholearm_jax.status import Status
-from wholearm_jax.stepping import Integration
-from wholearm_jax.variation import vary
-from wholearm_jax.wire import Resolution
+from wholearm_jax.core.status import Status
+from wholearm_jax.dynamics.path_dynamics import blank
+from wholearm_jax.ensembles.ensemble import vary
+from wholearm_jax.model.schedule import padded, window
+from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.phase_motion import move
+from wholearm_jax.tracing.path import Resolution
 
 LOOSE = 1e6  # a tolerance that accepts every step: steps are what lies between knots
 KNOTS, TORQUE = np.linspace(0.0, 1.0, 5), np.array([[0.9, -0.2], [0.1, 0.5], [0.8, 0.3], [0.2, 0.9], [1.0, 0.1]])

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax import scene_file
-from wholearm_jax.status import Status
+from wholearm_jax.core.status import Status
+from wholearm_jax.files import scene_toml as scene_file
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "wholearm_jax"

@@ -5,11 +5,19 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from wholearm_jax.drawing import COLUMN, PAPER, draw_forces, draw_pose, draw_result, draw_strip, draw_torques
-from wholearm_jax.palette import CONTACT_COLOURS, DASHES, contact_styles
-from wholearm_jax.plan import simulate
-from wholearm_jax.scene_file import load, parse, to_dict
-from wholearm_jax.schedule import torque
+from wholearm_jax.files.scene_toml import load, parse, to_dict
+from wholearm_jax.model.schedule import torque
+from wholearm_jax.phases.plan import simulate
+from wholearm_jax.plotting.palette import CONTACT_COLOURS, DASHES, contact_styles
+from wholearm_jax.plotting.plan_figures import (
+    COLUMN,
+    PAPER,
+    draw_forces,
+    draw_pose,
+    draw_result,
+    draw_strip,
+    draw_torques,
+)
 
 mpl.use("agg")
 

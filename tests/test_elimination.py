@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wholearm_jax.elimination import crossed, inverse, solve
+from wholearm_jax.core.small_linalg import crossed, inverse, solve
 
 
 @pytest.mark.parametrize("n", [1, 4, 5])

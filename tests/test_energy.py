@@ -6,11 +6,11 @@ import pytest
 from test_against_unreduced import DURATION, passing
 
 import wholearm_jax
-from wholearm_jax.contacts import contacts, slip_rows
-from wholearm_jax.phase import run
-from wholearm_jax.sampling import sample
-from wholearm_jax.scene import body
-from wholearm_jax.stepping import Integration
+from wholearm_jax.model.contact_kinematics import contacts, slip_rows
+from wholearm_jax.model.scene import body
+from wholearm_jax.phases.phase import run
+from wholearm_jax.phases.sampling import sample
+from wholearm_jax.simulation.integrator import Integration
 
 NODES = 8  # Gauss-Legendre points a step
 

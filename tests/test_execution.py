@@ -17,9 +17,9 @@ from matplotlib.path import Path as Outline
 from scipy.stats import binomtest
 
 import wholearm_jax as wa
-from wholearm_jax import execution
-from wholearm_jax.contacts import contacts, frames, normal_rows
-from wholearm_jax.execution import (
+from wholearm_jax.execution import rollout as execution
+from wholearm_jax.execution.mujoco_model import CONVEX, Softness, _wedges, free_bodies
+from wholearm_jax.execution.rollout import (
     Ending,
     Tolerance,
     clock,
@@ -31,12 +31,12 @@ from wholearm_jax.execution import (
     stepper,
     target_of,
 )
-from wholearm_jax.execution_drawing import animate, draw_execution, draw_execution_strip
-from wholearm_jax.free_bodies import CONVEX, Softness, _wedges, free_bodies
-from wholearm_jax.perturbation import Amounts, _perturbed, _summary, perturb, start_near, wilson
-from wholearm_jax.result_file import _perturbed_row, write_execution
-from wholearm_jax.scene import body, formation, parse_contact
-from wholearm_jax.system import system
+from wholearm_jax.execution.trials import Amounts, _perturbed, _summary, perturb, start_near, wilson
+from wholearm_jax.files.results import _perturbed_row, write_execution
+from wholearm_jax.model.contact_kinematics import contacts, frames, normal_rows
+from wholearm_jax.model.mechanics import system
+from wholearm_jax.model.scene import body, formation, parse_contact
+from wholearm_jax.plotting.execution_figures import animate, draw_execution, draw_execution_strip
 
 DATA = Path(__file__).parent / "data"
 NAMES = ("heptagon", "hexagon")

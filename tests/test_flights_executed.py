@@ -3,7 +3,7 @@
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.execution import execute
+from wholearm_jax.execution.rollout import execute
 
 
 @pytest.mark.parametrize("name", ["flight", "passage"])

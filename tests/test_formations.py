@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.formations import leaving, touching, ways
+from wholearm_jax.planning.successors import leaving, touching, ways
 
 
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])

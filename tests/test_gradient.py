@@ -10,9 +10,9 @@ import pytest
 from test_gradients import nearest_difference
 
 import wholearm_jax as wa
-from wholearm_jax.gradient import FORWARD, mode, torque_gradient
-from wholearm_jax.plan import least, outcomes
-from wholearm_jax.scene_file import to_dict
+from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.phases.gradients import FORWARD, mode, torque_gradient
+from wholearm_jax.phases.plan import least, outcomes
 
 DATA = Path(__file__).parent / "data"
 

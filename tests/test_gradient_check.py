@@ -6,7 +6,7 @@ import equinox as eqx
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.gradient_check import Slope, _steadiest, check_gradient
+from wholearm_jax.phases.gradient_check import Slope, _steadiest, check_gradient
 
 
 @pytest.fixture(scope="module")

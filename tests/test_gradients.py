@@ -10,13 +10,13 @@ import pytest
 from test_trace import ending_at_its_kink
 
 import wholearm_jax as wa
-from wholearm_jax.forces import score
-from wholearm_jax.gradient import torque_gradient
-from wholearm_jax.motion import move
-from wholearm_jax.plan import margin, steps_within
-from wholearm_jax.scene_file import to_dict
-from wholearm_jax.schedule import Torque, window
-from wholearm_jax.stepping import Integration
+from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.margin.contact_forces import score
+from wholearm_jax.model.schedule import Torque, window
+from wholearm_jax.phases.gradients import torque_gradient
+from wholearm_jax.phases.plan import margin, steps_within
+from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.phase_motion import move
 
 
 def richardson(function, largest):

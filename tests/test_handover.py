@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.handover import SURE, Moving, Near, Resting, handover
-from wholearm_jax.phase import balance_at_start
-from wholearm_jax.reduction import on_panel, powers
-from wholearm_jax.scene import replace_duration
-from wholearm_jax.scene_file import to_dict
+from wholearm_jax.dynamics.path_dynamics import on_panel, powers
+from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.model.scene import replace_duration
+from wholearm_jax.optimisation.rest_transition import SURE, Moving, Near, Resting, handover
+from wholearm_jax.phases.phase import balance_at_start
 
 RATE = 2.0
 LEAD = 0.25

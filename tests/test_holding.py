@@ -7,16 +7,16 @@ import pytest
 from scipy.optimize import linprog
 
 import wholearm_jax as wa
-from wholearm_jax.execution import Ending, execute
-from wholearm_jax.handover import Handover, steady
-from wholearm_jax.holding import statics, watch
-from wholearm_jax.phase import balance_at_start, run
-from wholearm_jax.result_file import summary
-from wholearm_jax.scene import replace_duration
-from wholearm_jax.scene_file import to_dict
-from wholearm_jax.schedule import padded
-from wholearm_jax.squeeze import hold
-from wholearm_jax.stepping import Integration
+from wholearm_jax.execution.rollout import Ending, execute
+from wholearm_jax.files.results import summary
+from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.margin.quasistatic import hold
+from wholearm_jax.margin.statics import statics, watch
+from wholearm_jax.model.scene import replace_duration
+from wholearm_jax.model.schedule import padded
+from wholearm_jax.optimisation.rest_transition import Handover, steady
+from wholearm_jax.phases.phase import balance_at_start, run
+from wholearm_jax.simulation.integrator import Integration
 
 HALF, MASS, MU, DRY, LIMIT = 0.03, 0.2, 0.3, 0.01, 1.0
 WEIGHT, HEIGHT = MASS * 9.81, 2 * HALF

@@ -8,8 +8,8 @@ import pytest
 from test_against_unreduced import passing
 
 import wholearm_jax
-from wholearm_jax import scene_file
-from wholearm_jax.sampling import sample
+from wholearm_jax.files import scene_toml as scene_file
+from wholearm_jax.phases.sampling import sample
 
 NAMES = ("heptagon", "hexagon")
 EXACT = 1e-10

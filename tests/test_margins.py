@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.plan import least, outcomes, roomy, steps_within
-from wholearm_jax.scene import replace_duration
-from wholearm_jax.scene_file import to_dict
-from wholearm_jax.stepping import Integration, with_room
+from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.model.scene import replace_duration
+from wholearm_jax.phases.plan import least, outcomes, roomy, steps_within
+from wholearm_jax.simulation.integrator import Integration, with_room
 
 
 @pytest.fixture(scope="module")

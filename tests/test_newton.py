@@ -8,10 +8,10 @@ import pytest
 from scipy.optimize import root
 
 import wholearm_jax as wa
-from wholearm_jax.contacts import constraint_rows, constraints, slip_rows
-from wholearm_jax.newton import along_wire, newton
-from wholearm_jax.scene import body
-from wholearm_jax.system import system
+from wholearm_jax.model.contact_kinematics import constraint_rows, constraints, slip_rows
+from wholearm_jax.model.mechanics import system
+from wholearm_jax.model.scene import body
+from wholearm_jax.tracing.path_root import along_wire, newton
 
 
 @pytest.fixture(scope="module")

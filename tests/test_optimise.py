@@ -10,11 +10,11 @@ import optax
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.descent import COLDEST, JOINED
-from wholearm_jax.pacing import CONVERGED
-from wholearm_jax.plan import simulate
-from wholearm_jax.scene_file import to_dict
-from wholearm_jax.verdict import ARRIVAL
+from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.optimisation.interior_point import COLDEST, JOINED
+from wholearm_jax.optimisation.solver import CONVERGED
+from wholearm_jax.phases.assessment import ARRIVAL
+from wholearm_jax.phases.plan import simulate
 
 # Largest minimum force [N] that direct collocation reached on the same plans at 1 s a phase, equal to the bound.
 BOUNDS = {"heptagon": (0.966, 0.838), "hexagon": (0.694, 1.830)}

@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import pytest
 
-from wholearm_jax import programs
+from wholearm_jax.core import programs
 
 
 class Ramp(eqx.Module):

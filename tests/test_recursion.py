@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.group import stacked_tables
-from wholearm_jax.linearisation import Limits, linearise
-from wholearm_jax.plan import trace
-from wholearm_jax.precision import array
-from wholearm_jax.recursion import SPREAD, nearest, newton_step
-from wholearm_jax.shooting import Variables
-from wholearm_jax.stepping import Integration
+from wholearm_jax.core.arrays import array
+from wholearm_jax.optimisation.coupled_phases import stacked_tables
+from wholearm_jax.optimisation.linearisation import Limits, linearise
+from wholearm_jax.optimisation.multiple_shooting import Variables
+from wholearm_jax.optimisation.riccati import SPREAD, nearest, newton_step
+from wholearm_jax.phases.plan import trace
+from wholearm_jax.simulation.integrator import Integration
 
 KNOTS = 7
 

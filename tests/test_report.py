@@ -7,11 +7,11 @@ import shutil
 import numpy as np
 import pytest
 
-from wholearm_jax.plan import simulate
-from wholearm_jax.report import _worst, read_result, render, report
-from wholearm_jax.result_file import summary, write_summary, write_torque, write_trajectory
-from wholearm_jax.scene_file import SceneError, load, parse, to_dict
-from wholearm_jax.schedule import torque
+from wholearm_jax.files.results import summary, write_summary, write_torque, write_trajectory
+from wholearm_jax.files.scene_toml import SceneError, load, parse, to_dict
+from wholearm_jax.model.schedule import torque
+from wholearm_jax.phases.plan import simulate
+from wholearm_jax.report.page import _worst, read_result, render, report
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 CHROMIUM = next((path for path in map(shutil.which, NAMES) if path), None)

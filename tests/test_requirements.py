@@ -6,9 +6,9 @@ import sys
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.execution import execute
-from wholearm_jax.perturbation import Amounts, perturb
-from wholearm_jax.variation import vary
+from wholearm_jax.ensembles.ensemble import vary
+from wholearm_jax.execution.rollout import execute
+from wholearm_jax.execution.trials import Amounts, perturb
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_arguments_that_make_no_sense(call, message, plan):
 
 TOLD_WHAT_JAX_DOES = """
 import jax
-from wholearm_jax.requirements import require_x64
+from wholearm_jax.core.validation import require_x64
 jax.config.update("jax_enable_x64", True)
 jax.monitoring.register_event_duration_secs_listener(lambda event, _, **__: print(event))
 """

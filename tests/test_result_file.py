@@ -9,12 +9,12 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from wholearm_jax.plan import simulate
-from wholearm_jax.result_file import read_torque, summary, write_summary, write_torque, write_trajectory
-from wholearm_jax.scene_file import SceneError, load, parse, to_dict
-from wholearm_jax.schedule import torque
-from wholearm_jax.status import Status
-from wholearm_jax.writing import write_whole
+from wholearm_jax.core.atomic_files import write_whole
+from wholearm_jax.core.status import Status
+from wholearm_jax.files.results import read_torque, summary, write_summary, write_torque, write_trajectory
+from wholearm_jax.files.scene_toml import SceneError, load, parse, to_dict
+from wholearm_jax.model.schedule import torque
+from wholearm_jax.phases.plan import simulate
 
 HEADER = (
     "t,phase,x,y,phi,theta1,theta2,x_dot,y_dot,phi_dot,theta1_dot,theta2_dot,tau1,tau2,cn1,cn2,cn3,cn4,ct1,ct2,ct3,ct4"

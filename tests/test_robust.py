@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.robust import optimise_robustly
-from wholearm_jax.scene import replace_duration
-from wholearm_jax.variation import vary
+from wholearm_jax.ensembles.ensemble import vary
+from wholearm_jax.ensembles.robust import optimise_robustly
+from wholearm_jax.model.scene import replace_duration
 
 
 @pytest.fixture(scope="module")

@@ -11,14 +11,22 @@ from test_against_unreduced import passing
 from test_gradients import assert_modes_and_differences_agree
 
 import wholearm_jax
-from wholearm_jax import scene_file, squeeze
-from wholearm_jax.contacts import constraint_curvature, constraint_rows, constraints, contacts, placed, slip_rows
-from wholearm_jax.phase import run
-from wholearm_jax.reduction import on_panel, powers
-from wholearm_jax.sampling import sample
-from wholearm_jax.scene import body, formation
-from wholearm_jax.schedule import Torque
-from wholearm_jax.stepping import Integration
+from wholearm_jax.dynamics.path_dynamics import on_panel, powers
+from wholearm_jax.files import scene_toml as scene_file
+from wholearm_jax.margin import quasistatic as squeeze
+from wholearm_jax.model.contact_kinematics import (
+    constraint_curvature,
+    constraint_rows,
+    constraints,
+    contacts,
+    placed,
+    slip_rows,
+)
+from wholearm_jax.model.scene import body, formation
+from wholearm_jax.model.schedule import Torque
+from wholearm_jax.phases.phase import run
+from wholearm_jax.phases.sampling import sample
+from wholearm_jax.simulation.integrator import Integration
 
 DURATION = 1.0
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.sampling import Trajectory
-from wholearm_jax.scene import replace_duration
+from wholearm_jax.model.scene import replace_duration
+from wholearm_jax.phases.sampling import Trajectory
 
 SAMPLES = 401
 

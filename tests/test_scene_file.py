@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import tomli_w
 
-from wholearm_jax.scene import body, heading
-from wholearm_jax.scene_file import SceneError, bundled, load, parse, save, to_dict
+from wholearm_jax.files.scene_toml import SceneError, bundled, load, parse, save, to_dict
+from wholearm_jax.model.scene import body, heading
 
 NAN, INF = float("nan"), float("inf")
 SQUARE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]

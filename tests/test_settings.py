@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax import settings
-from wholearm_jax.recursion import Quadratic, _back, _order, _Stages
+from wholearm_jax.core import config as settings
+from wholearm_jax.optimisation.riccati import Quadratic, _back, _order, _Stages
 
 LOOKING = """
 import jax

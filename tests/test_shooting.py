@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax import squeeze
-from wholearm_jax.descent import moved
-from wholearm_jax.forces import arcs, on_arc
-from wholearm_jax.linearisation import Limits
-from wholearm_jax.motion import move
-from wholearm_jax.plan import trace
-from wholearm_jax.schedule import window
-from wholearm_jax.shooting import Variables, local, shoot
-from wholearm_jax.stepping import Integration
+from wholearm_jax.margin import quasistatic as squeeze
+from wholearm_jax.margin.contact_forces import arcs, on_arc
+from wholearm_jax.model.schedule import window
+from wholearm_jax.optimisation.interior_point import moved
+from wholearm_jax.optimisation.linearisation import Limits
+from wholearm_jax.optimisation.multiple_shooting import Variables, local, shoot
+from wholearm_jax.phases.plan import trace
+from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.phase_motion import move
 
 HOW = Integration()
 

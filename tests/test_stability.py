@@ -12,21 +12,21 @@ from matplotlib.path import Path
 from test_gradients import nearest_difference
 
 import wholearm_jax as wa
-from wholearm_jax.contacts import frames, gaps
-from wholearm_jax.forces import REFINED, SAMPLES, arc, score
-from wholearm_jax.motion import move
-from wholearm_jax.phase import ending, prepare
-from wholearm_jax.plan import outcomes
-from wholearm_jax.reduction import balance, blank, on_panel, powers
-from wholearm_jax.sampling import sample
-from wholearm_jax.scene import body
-from wholearm_jax.schedule import window
-from wholearm_jax.squeeze import hold, holds
-from wholearm_jax.start import _pierced
-from wholearm_jax.stepping import Integration
-from wholearm_jax.system import system
-from wholearm_jax.watch import Watched, crossings
-from wholearm_jax.wire import Resolution
+from wholearm_jax.dynamics.path_dynamics import balance, blank, on_panel, powers
+from wholearm_jax.margin.contact_forces import REFINED, SAMPLES, arc, score
+from wholearm_jax.margin.quasistatic import hold, holds
+from wholearm_jax.model.contact_kinematics import frames, gaps
+from wholearm_jax.model.mechanics import system
+from wholearm_jax.model.scene import body
+from wholearm_jax.model.schedule import window
+from wholearm_jax.phases.phase import ending, prepare
+from wholearm_jax.phases.plan import outcomes
+from wholearm_jax.phases.sampling import sample
+from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.phase_motion import move
+from wholearm_jax.tracing.events import Watched, crossings
+from wholearm_jax.tracing.path import Resolution
+from wholearm_jax.tracing.projection import _pierced
 
 
 def scene(vertices, contacts, toward, start, *, joint, length, offset=(0.0, 0.0)):

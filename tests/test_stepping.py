@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.schedule import window
-from wholearm_jax.stepping import Integration, Stop, found, repeated, reversible
+from wholearm_jax.model.schedule import window
+from wholearm_jax.simulation.integrator import Integration, Stop, found, repeated, reversible
 
 NEVER = -jnp.inf
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.contacts import gaps, normal_rows, slip_rows
-from wholearm_jax.phase import ending, prepare
-from wholearm_jax.reduction import combined, on_panel, powers
-from wholearm_jax.scene import body
-from wholearm_jax.scene_file import to_dict
-from wholearm_jax.system import system
-from wholearm_jax.wire import Resolution, _panels
+from wholearm_jax.dynamics.path_dynamics import combined, on_panel, powers
+from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.model.contact_kinematics import gaps, normal_rows, slip_rows
+from wholearm_jax.model.mechanics import system
+from wholearm_jax.model.scene import body
+from wholearm_jax.phases.phase import ending, prepare
+from wholearm_jax.tracing.path import Resolution, _panels
 
 ENDS = {
     "heptagon": ("finger2:v4 is made", "palm:v0 is made"),

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.forces import Score
-from wholearm_jax.motion import Motion
-from wholearm_jax.reduction import Change
-from wholearm_jax.verdict import ARRIVAL, BRAKING, GOALS, PULL, judge
+from wholearm_jax.dynamics.path_dynamics import Change
+from wholearm_jax.margin.contact_forces import Score
+from wholearm_jax.phases.assessment import ARRIVAL, BRAKING, GOALS, PULL, judge
+from wholearm_jax.simulation.phase_motion import Motion
 
 S = wa.Status
 CALM = Change(speed=jnp.asarray(0.0), impulse=jnp.zeros(4), size=jnp.asarray(1.0))

@@ -7,18 +7,18 @@ Read the modules in this order: `scene`, `contacts`, `system`, `newton`, `watch`
 (many scenes at once), `free_bodies`, `coulomb`, `execution` and `perturbation` (virtual hardware).
 """
 
-from wholearm_jax.baseline import search
-from wholearm_jax.batch import check
-from wholearm_jax.optimiser import bounds, optimise, quasistatic
-from wholearm_jax.plan import margin, simulate, trace
-from wholearm_jax.result_file import read_torque, write_torque
-from wholearm_jax.sampling import trajectory
-from wholearm_jax.scene import Scene
-from wholearm_jax.scene_file import load, parse, save
-from wholearm_jax.schedule import Torque, torque
-from wholearm_jax.settings import configure
-from wholearm_jax.status import Status
-from wholearm_jax.stepping import Integration
+from wholearm_jax.core.config import configure
+from wholearm_jax.core.status import Status
+from wholearm_jax.ensembles.batch import check
+from wholearm_jax.files.results import read_torque, write_torque
+from wholearm_jax.files.scene_toml import load, parse, save
+from wholearm_jax.model.scene import Scene
+from wholearm_jax.model.schedule import Torque, torque
+from wholearm_jax.optimisation.optimiser import bounds, optimise, quasistatic
+from wholearm_jax.optimisation.step_search import search
+from wholearm_jax.phases.plan import margin, simulate, trace
+from wholearm_jax.phases.sampling import trajectory
+from wholearm_jax.simulation.integrator import Integration
 
 __all__ = [
     "Integration",

@@ -1,0 +1,41 @@
+"""`wholearm optimise --robust`: torques for an ensemble of scenes instead of one."""
+
+import sys
+from pathlib import Path
+
+from wholearm_jax.cli.arguments import BadInput, descending
+from wholearm_jax.cli.output import write_result
+
+
+def optimise_robustly(
+    varied, folder: Path | None, samples: int, knots: int, steps: int, arrival: float, report: bool
+) -> None:
+    """Find the torques, say how they do on seen and unseen scenes, write what becomes of the nominal one, and exit."""
+    from wholearm_jax.ensembles.robust import optimise_robustly as find
+    from wholearm_jax.optimisation.optimiser import bounds
+    from wholearm_jax.phases.plan import require_motion, simulate
+
+    try:
+        require_motion(varied.scene)
+    except ValueError as error:
+        raise BadInput(f"--robust: {error}") from None
+    with descending() as progress:
+        bar = progress.add_task("robust", total=steps + 1, state="the nominal schedule")
+
+        def show(step, held):
+            progress.update(bar, completed=step + 1, state=f"{100 * held.share:.0f} % hold, worst {held.margin:.4f} N")
+
+        found = find(varied, samples=samples, knots=knots, steps=steps, arrival=arrival, callback=show)
+    for name, (nominal, robust) in (("sampled", found.seen), ("unseen", found.unseen)):
+        told = (f"{100 * h.share:.1f} % hold, worst margin {h.margin:.4g} N" for h in (nominal, robust))
+        print(f"{samples} {name} scenes: nominal {next(told)}; robust {next(told)}")
+    result = simulate(varied.scene, found.torque, arrival=arrival)
+    nominal, robust = found.unseen
+    more = {"command": "optimise --robust", "knots": knots, "steps": steps, "varied": samples, "arrival": arrival}
+    amounts = (f"{name}={100 * a.size:g}%" if a.relative else f"{name}={a.size:g}" for name, a in varied.amounts)
+    more |= {"robust": ", ".join(amounts), "seed": varied.seed}
+    more |= {"unseen_share": robust.share, "unseen_margin": robust.margin}
+    more |= {"unseen_share_nominal": nominal.share, "unseen_margin_nominal": nominal.margin}
+    tops = tuple(float(b.value) for b in bounds(varied.scene))
+    write_result(result, folder, 201, report, bounds=tops, **more)
+    sys.exit(0 if robust.share == 1.0 else 1)

@@ -1,0 +1,391 @@
+"""Check: one torque schedule against very many scenes, each traced, reduced, simulated, scored and judged.
+
+Two programs, compiled side by side, serve all scenes: one traces the wires of a plan, the other reduces the equations
+of motion on them and simulates; each is a scan over its phases. A CPU does a block of scenes one after the other, each
+with loops that do what it needs and no more; a GPU does them side by side (`jax.vmap`). Where all scenes have the same
+wires, these are traced once a block. Where there are several devices `shard_map` gives each its own block. A chunk is a
+number of blocks. The first pass is coarse (`QUICK`): few panels, fewer steps. It knows its error; scenes for which that
+is too large, or which ran out of steps, are packed together and done again at full resolution (`FULL`), and what is
+left then alone, by `plan.simulate`. So neither the slowest scene nor one that cannot be followed holds up the others
+or touches their results.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int
+
+from wholearm_jax.core.programs import Program, beside, wait
+from wholearm_jax.core.status import Status
+from wholearm_jax.core.validation import require_positive, require_x64
+from wholearm_jax.dynamics.path_dynamics import Table, reduce_wire
+from wholearm_jax.ensembles.ensemble import Ensemble, stack
+from wholearm_jax.model.mechanics import system
+from wholearm_jax.model.scene import Formation, Scene, body
+from wholearm_jax.model.schedule import Torque, padded
+from wholearm_jax.phases.phase import Outcome, final_configuration
+from wholearm_jax.phases.plan import (
+    require_covered,
+    require_motion,
+    simulate,
+    simulate_first,
+    simulate_next,
+    simulate_told,
+    stacked,
+    steps_within,
+    wires_together,
+)
+from wholearm_jax.phases.rest_certificate import surely_held
+from wholearm_jax.phases.result import Result
+from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.tracing.path import Resolution, Wire, blank
+
+BLOCK = 128  # scenes that one device takes at once
+CHUNK = 4096  # scenes whose results are kept together
+ARRIVAL = 0.01  # share of the wire: plans that vary cannot end where the one must that torques were made for
+GOOD, FINER, ALONE = range(3)  # what becomes of a scene at a level
+EXACT = 1e-9  # tolerances below this begin at the full resolution
+
+
+class Checked(NamedTuple):
+    """What became of scenes; leading axes run over them.
+
+    `status` are `Status` values: that of the first phase that is not ok. `margin` [N] is the least over the plan, minus
+    infinity where a phase has no motion to score. `phase`, `contact` (a row of the phase's `Formation.names`, -1:
+    none) and `time` [s] say where it failed, or where the margin is where it did not. `end` is `z` (SI) where the
+    motion of the failed or last phase ended, NaN where that phase has no wire.
+    """
+
+    status: Int[Array | np.ndarray, "*scenes"]
+    margin: Float[Array | np.ndarray, "*scenes"]
+    time: Float[Array | np.ndarray, "*scenes"]
+    contact: Int[Array | np.ndarray, "*scenes"]
+    phase: Int[Array | np.ndarray, "*scenes"]
+    end: Float[Array | np.ndarray, "*scenes 5"]
+
+
+class Level(NamedTuple):
+    """How finely to compute, and the table error up to which the result counts."""
+
+    resolution: Resolution
+    how: Integration
+    error: float
+
+
+QUICK = Level(Resolution(4, 7, 8, 64), Integration(tolerance=1e-8, max_steps=96, stages=4), 5e-7)
+FULL = Level(Resolution(), Integration(), 1e-9)
+
+
+class Source(Protocol):
+    """What scenes come from: an `Ensemble`, or scenes that are given (`Given`)."""
+
+    @property
+    def nominal(self) -> Scene:
+        """Its scene, or scenes, as far as all are alike in: phases, their names and how they arrive."""
+        ...
+
+    @property
+    def same_wires(self) -> bool:
+        """Whether all scenes have the wires of one."""
+        ...
+
+    def draw(self, number: Int[Array, ""]) -> Scene:
+        """Scene number `number`."""
+        ...
+
+
+class Given(eqx.Module):
+    """Scenes stacked along a leading axis (`variation.stack`)."""
+
+    scenes: Scene
+
+    @property
+    def nominal(self) -> Scene:
+        """The stacked scenes."""
+        return self.scenes
+
+    @property
+    def same_wires(self) -> bool:
+        """Not that it is known."""
+        return False
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return self.scenes.object.mass.shape[0]
+
+    def draw(self, number: Int[Array, ""]) -> Scene:
+        """Scene number `number`."""
+        return jax.tree.map(lambda leaf: leaf[number], self.scenes)
+
+    def part(self, numbers: np.ndarray) -> "Given":
+        """Some of the scenes, numbered anew."""
+        return Given(jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), self.scenes))
+
+
+class _Stop(NamedTuple):
+    """One phase of a check."""
+
+    status: Int[Array, ""]
+    margin: Float[Array, ""]
+    margin_time: Float[Array, ""]
+    margin_contact: Int[Array, ""]
+    time: Float[Array, ""]
+    contact: Int[Array, ""]
+    end: Float[Array, "5"]
+    good: Bool[Array, ""]
+    held: Bool[Array, ""]
+
+
+def check(
+    scenes: Ensemble | Scene | Sequence[Scene],
+    torque: Torque,
+    *,
+    count: int | None = None,
+    tolerance: float = 1e-6,
+    arrival: float = ARRIVAL,
+    chunk: int = CHUNK,
+    devices: Sequence[Any] | None = None,
+) -> Checked:
+    """Check a torque schedule against many scenes: the first `count` of an ensemble, or all that are given.
+
+    `scenes` may differ in every number, in formations and in the number of vertices (see `variation.stack`).
+    Margins are right to 1e-6 N; a `tolerance` [N] below 1e-9 has all computed as by `simulate`. A phase arrives when
+    it ends within a share `arrival` of its wire's length of the end (1e-6 for a plan that does not vary, by
+    `simulate`), at a speed that fits (`verdict.BRAKING`). Memory is that of `chunk` scenes beside the result. Returns
+    `Checked`: status, margin, time, contact, phase and end pose of each scene. Never raises for a scene that fails:
+    that is a status. Raises ValueError for one scene that is not stacked, for a schedule shorter than a plan, for
+    numbers that are not positive, and for a `count` of more scenes than are given.
+    """
+    if isinstance(scenes, Scene) and np.ndim(scenes.object.mass) == 0:
+        raise ValueError("this is one scene: check [scene], or vary it (wholearm_jax.ensembles.ensemble.vary)")
+    source = scenes if isinstance(scenes, Ensemble) else Given(scenes if isinstance(scenes, Scene) else stack(scenes))
+    if count is None:
+        if isinstance(source, Ensemble):
+            raise ValueError("an ensemble has no end: say how many of its scenes to check, with count")
+        count = source.count
+    elif isinstance(source, Given) and count > source.count:
+        raise ValueError(f"count is {count}, but {source.count} scenes are given")
+    parts = check_chunks(source, torque, count, tolerance=tolerance, arrival=arrival, chunk=chunk, devices=devices)
+    return Checked(*(np.concatenate(column) for column in zip(*(part for _, part in parts), strict=True)))
+
+
+def check_chunks(
+    source: Ensemble | Given,
+    torque: Torque,
+    count: int,
+    *,
+    tolerance: float = 1e-6,
+    arrival: float = ARRIVAL,
+    chunk: int = CHUNK,
+    devices: Sequence[Any] | None = None,
+    wanted: Sequence[int] | None = None,
+) -> Iterator[tuple[int, Checked]]:
+    """`check` one chunk after the other: numbers of chunks (those `wanted`, by default all) with their results."""
+    require_x64()
+    require_positive(count=count, tolerance=tolerance, arrival=arrival, chunk=chunk)
+    require_motion(source.nominal)  # holds need linear programmes, which compiled checks leave out
+    require_covered(source.nominal, torque)
+    mesh = Mesh(np.asarray(devices or jax.local_devices()), ("scenes",))
+    levels = (QUICK, FULL) if tolerance >= EXACT else (FULL,)
+    for number in range(-(-count // chunk)) if wanted is None else wanted:
+        rows = np.arange(number * chunk, min(count, (number + 1) * chunk))
+        yield number, _check_rows(source, rows, torque, jnp.asarray(arrival), levels, mesh)
+
+
+def _check_rows(source, rows, torque: Torque, arrival, levels, mesh) -> Checked:
+    """Check some scenes, level by level; alone those of the last that are not good, and of any that want `ALONE`."""
+    schedule, steps = padded(torque), steps_within(source.nominal, torque)
+    found, left, alone = None, np.arange(len(rows)), []
+    for level in levels:
+        level = level._replace(how=replace(level.how, steps=steps))
+        answer, grade = _check_packed(source, rows[left], schedule, arrival, level, mesh)
+        if found is None:
+            found = answer
+        else:
+            for column, new in zip(found, answer, strict=True):
+                column[left] = new
+        alone.append(left[grade == ALONE])
+        left = left[grade == FINER]
+        if not len(left):
+            break
+    assert found is not None
+    for row in np.concatenate([*alone, left]):
+        answer = _check_alone(source.draw(rows[row]), torque, arrival)
+        for column, new in zip(found, answer, strict=True):
+            column[row] = new
+    return found
+
+
+def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):
+    """Check scenes block by block, the last block filled up with its last scene."""
+    size = BLOCK * mesh.size
+    filled = np.append(rows, np.repeat(rows[-1:], -len(rows) % size))
+    answers = []
+    for block in filled.reshape(-1, size):
+        few = source if isinstance(source, Ensemble) else source.part(block)
+        numbers = block if isinstance(source, Ensemble) else np.arange(size)
+        answers.append(_check_block(few, jnp.asarray(numbers), schedule, arrival, level, mesh))
+    columns = jax.tree.map(lambda *parts: np.concatenate([np.asarray(p) for p in parts])[: len(rows)], *answers)
+    return columns
+
+
+def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Level, mesh: Mesh):
+    """Check `BLOCK` scenes a device: on a processor one after the other."""
+    side_by_side = mesh.devices.flat[0].platform != "cpu"
+    told = source, schedule, arrival, level, side_by_side
+    compiled = beside(_check_blank, mesh, told, numbers)
+    wires = _on(mesh, _wires_of, (source, level.resolution, side_by_side), numbers)
+    wait(compiled)
+    return _on(mesh, _checks_of, told, numbers, wires)
+
+
+def _check_blank(mesh: Mesh, told: tuple, numbers) -> None:
+    """Check scenes on wires that were not found: that compiles the program for those that were."""
+    source, _, _, level, _ = told
+    shape = mesh.size if source.same_wires else len(numbers), len(source.nominal.phases)
+    wires = jax.tree.map(lambda a: np.broadcast_to(a, (*shape, *a.shape)), blank(level.resolution))
+    if mesh.size > 1:  # where those that are traced will be
+        wires = jax.device_put(wires, NamedSharding(mesh, PartitionSpec("scenes")))
+    _on(mesh, _checks_of, told, numbers, wires)
+
+
+def _on(mesh: Mesh, program: Program, told: tuple, *each):
+    """Call a program on all devices, with what all are `told` and what is `each` one's own."""
+    return program(told, *each) if mesh.size == 1 else _apart(mesh, program, told, *each)
+
+
+@Program
+def _apart(mesh: Mesh, program: Program, told: tuple, *each):
+    arrays, static = eqx.partition(told, eqx.is_array)
+
+    def local(arrays, *each):
+        return program(eqx.combine(arrays, static), *each)
+
+    own, whole = PartitionSpec("scenes"), PartitionSpec()
+    specs = (whole, *(own for _ in each))
+    return jax.shard_map(local, mesh=mesh, in_specs=specs, out_specs=own, check_vma=False)(arrays, *each)
+
+
+@Program
+def _wires_of(told, numbers):
+    """The wires of scenes: of one alone where all have the same."""
+    source, resolution, side_by_side = told
+
+    def one(number):
+        return wires_together(source.draw(number), resolution)
+
+    return _each(one, side_by_side)(numbers[:1] if source.same_wires else numbers)
+
+
+@Program
+def _checks_of(told, numbers, wires):
+    """Check scenes on their wires."""
+    source, schedule, arrival, level, side_by_side = told
+
+    def on_wires(number, wires):
+        return check_wires(source.draw(number), wires, schedule, arrival, level)
+
+    if source.same_wires:
+        shared = jax.tree.map(lambda a: a[0], wires)
+        return _each(lambda number: on_wires(number, shared), side_by_side)(numbers)
+    return _each(lambda one: on_wires(*one), side_by_side)((numbers, wires))
+
+
+def _each(function, side_by_side: bool):
+    """A function of many, side by side or one after the other."""
+    return jax.vmap(function) if side_by_side else partial(jax.lax.map, function)
+
+
+def check_scene(scene: Scene, schedule: Torque, arrival, level: Level) -> tuple[Checked, Int[Array, ""]]:
+    """Check one scene (under any transformation), and say whether this level's result is `GOOD`, or wants a `FINER` one
+    or `simulate` for this scene `ALONE`."""
+    return check_wires(scene, wires_together(scene, level.resolution), schedule, arrival, level)
+
+
+def check_wires(scene: Scene, wires: Wire, schedule: Torque, arrival, level: Level) -> tuple[Checked, Int[Array, ""]]:
+    """Check one scene on its wires."""
+    solid = body(scene.object)
+
+    def one(clock, phase):
+        wire, motion, formation = phase
+        mechanics = system(solid, scene.hand, scene.gravity, formation)
+        table = reduce_wire(mechanics, wire)
+        clock, done = simulate_next(schedule, level.how, arrival, clock, (table, *motion))
+        held = surely_held(mechanics, table, schedule, done)
+        return clock, _stop(table, done, formation, level, held)
+
+    told = stacked([(simulate_told(p), p.formation) for p in scene.phases])
+    _, stops = jax.lax.scan(one, simulate_first(schedule), (wires, *told))
+    failed = stops.status != int(Status.OK)
+    where = jnp.where(failed.any(), jnp.argmax(failed), jnp.argmin(stops.margin))
+    last = jnp.where(failed.any(), where, len(scene.phases) - 1)
+    # What follows a failure counts for nothing but the margin; where it has none, that is known.
+    counts = jnp.arange(len(scene.phases)) <= last
+    needed = counts | (stops.status != int(Status.NO_CONVERGENCE))
+    ok = ~failed.any()
+    answer = Checked(
+        status=stops.status[where],
+        margin=stops.margin.min(),
+        time=jnp.where(ok, stops.margin_time, stops.time)[where],
+        contact=jnp.where(ok, stops.margin_contact, stops.contact)[where],
+        phase=where,
+        end=stops.end[last],
+    )
+    # Where only a linear programme can tell whether friction holds a rest, `simulate` asks it.
+    doubtful = jnp.any(~stops.held & counts)
+    return answer, jnp.select([jnp.any(~stops.good & needed), doubtful], [FINER, ALONE], GOOD)
+
+
+def _stop(table: Table, done: Outcome, formation: Formation, level: Level, held) -> _Stop:
+    """One phase's result, and whether it is to be trusted: a fine table, and neither steps nor pieces used up; rests
+    that are `held` for sure."""
+    motion = done.motion
+    known = jnp.isfinite(done.score.margin) & (table.status == 0)
+    of_slot = jnp.cumsum(~formation.tangential) - 1
+    status, contact = done.verdict.status, done.verdict.contact
+    worth = (status != int(Status.MAX_STEPS)) & (status != int(Status.NO_CONVERGENCE))
+    fine = (table.error <= level.error) & (table.count < level.resolution.pieces)
+    return _Stop(
+        status=status,
+        margin=jnp.where(known, done.score.margin, -jnp.inf),
+        margin_time=done.start + done.duration * done.score.share,
+        margin_contact=of_slot[done.score.contact],
+        time=done.start + done.duration * done.verdict.share,
+        contact=jnp.where(contact >= 0, of_slot[contact], -1),
+        end=jnp.where(table.status == 0, final_configuration(table, motion), jnp.nan),
+        good=jnp.where(table.status == 0, fine & worth, worth),
+        held=held | (table.status != 0),
+    )
+
+
+def _check_alone(scene: Scene, torque: Torque, arrival) -> Checked:
+    """One scene by `simulate`, which refines until all is fine."""
+    return from_result(simulate(scene, torque, arrival=float(arrival)))
+
+
+def from_result(result: Result) -> Checked:
+    """A simulated plan as one scene of a check."""
+    rows = list(result.phases)
+    failed = next((k for k, p in enumerate(rows) if p.status is not Status.OK), None)
+    where = int(np.argmin([p.margin for p in rows])) if failed is None else failed
+    last = rows[-1 if failed is None else failed]
+    p = rows[where]
+    named = p.margin_contact if failed is None else p.contact
+    table, motion = last.traced.table, last.outcome.motion
+    end = final_configuration(table, motion) if int(table.status) == Status.OK else jnp.full(5, jnp.nan)
+    return Checked(
+        status=np.asarray(int(result.status)),
+        margin=np.asarray(result.margin),
+        time=np.asarray(p.margin_time if failed is None else p.time),
+        contact=np.asarray(p.contacts.index(named) if named else -1),
+        phase=np.asarray(where),
+        end=np.asarray(end),
+    )

@@ -1,0 +1,108 @@
+"""Summarise: what became of very many scenes, without holding more of them than a sample."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from wholearm_jax.core.status import Status
+from wholearm_jax.ensembles.batch import Checked
+from wholearm_jax.ensembles.proportion import wilson
+from wholearm_jax.model.scene import Scene
+
+SAMPLE = 100_000  # scenes, evenly spread, from which quantiles and influences are taken
+QUANTILES = (0.0, 0.01, 0.05, 0.5, 0.95, 1.0)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """How many of `count` scenes hold and how the others fail.
+
+    `failures` counts (phase, status, contact), by name. `numbers` are the sampled scenes, `margins` [N] and `statuses`
+    theirs.
+    """
+
+    count: int
+    holds: int
+    failures: dict[tuple[str, str, str | None], int]
+    numbers: np.ndarray
+    margins: np.ndarray
+    statuses: np.ndarray
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The 95 % confidence interval of the share that holds (Wilson's)."""
+        return wilson(self.holds, self.count)
+
+    @property
+    def quantiles(self) -> dict[str, float]:
+        """Margins [N] by the share of the scenes that stay below; minus infinity where no motion could be scored."""
+        ordered = np.sort(self.margins)
+        return {f"{q:g}": float(ordered[round(q * (len(ordered) - 1))]) for q in QUANTILES}
+
+    @property
+    def lines(self) -> list[str]:
+        """The survey in words."""
+        low, high = (100 * end for end in self.interval)
+        share = 100 * self.holds / self.count
+        told = [f"{self.holds} of {self.count} hold: {share:.2f} %, 95 % confidence interval {low:.2f} to {high:.2f} %"]
+        told.append("margin [N] by quantile: " + ", ".join(f"{q}: {m:.4g}" for q, m in self.quantiles.items()))
+        for (phase, status, contact), many in sorted(self.failures.items(), key=lambda item: -item[1]):
+            told.append(f"{phase}: {status}" + (f" at {contact}" if contact else "") + f": {many}")
+        return told
+
+    def as_dict(self) -> dict:
+        """The survey for a JSON file."""
+        keys = ("phase", "status", "contact", "count")
+        often = sorted(self.failures.items(), key=lambda item: -item[1])
+        return {
+            "count": self.count,
+            "holds": self.holds,
+            "share": self.holds / self.count,
+            "interval": list(self.interval),
+            "quantiles": {q: m if np.isfinite(m) else None for q, m in self.quantiles.items()},
+            "failures": [dict(zip(keys, (*key, many), strict=True)) for key, many in often],
+        }
+
+
+def survey(scene: Scene, chunks: Iterable[Checked], count: int) -> Survey:
+    """Count through chunks of results; `scene` gives phases and contacts their names."""
+    every, first, holds, failures = max(1, -(-count // SAMPLE)), 0, 0, Counter()
+    numbers, margins, statuses = [], [], []
+    for part in chunks:
+        bad = part.status != Status.OK
+        holds += int((~bad).sum())
+        rows, many = np.unique(
+            np.stack([part.phase[bad], part.status[bad], part.contact[bad]]).astype(int), axis=1, return_counts=True
+        )
+        for (phase, status, contact), number in zip(rows.T.tolist(), many.tolist(), strict=True):
+            at = scene.phases[phase]
+            name = at.formation.names[contact] if contact >= 0 else None
+            failures[at.name, Status(status).label, name] += number
+        kept = np.arange(-first % every, len(part.status), every)
+        numbers.append(first + kept)
+        margins.append(part.margin[kept])
+        statuses.append(part.status[kept])
+        first += len(part.status)
+    return Survey(count, holds, dict(failures), *(np.concatenate(column) for column in (numbers, margins, statuses)))
+
+
+def influences(margins: Float[np.ndarray, "n"], shifts: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "p"]:
+    """Spearman's rank correlation of the margin with each parameter, like values sharing the mean of their ranks; 0
+    where either does not vary."""
+    from scipy.stats import rankdata  # takes half a second to import
+
+    ranks = rankdata(margins)
+    found = []
+    for column in shifts.T:
+        varies = len(margins) > 1 and np.ptp(column) > 0 and np.ptp(ranks) > 0
+        found.append(np.corrcoef(ranks, rankdata(column))[0, 1] if varies else 0.0)
+    return np.asarray(found)
+
+
+def most_influential(parameters: Sequence[str], influence: Float[np.ndarray, "p"], most: int = 2) -> list[int]:
+    """The numbers of the parameters that the margin depends on most."""
+    order = np.argsort(-np.abs(influence), kind="stable")
+    return [int(k) for k in order[:most] if influence[k] != 0 and parameters[k]]

@@ -1,0 +1,248 @@
+r"""Virtual hardware: the hand and the polygon as free bodies in MuJoCo, held together by nothing but soft contacts.
+
+The coordinates are those of the prediction, `z = (x, y, phi, theta1, theta2)`: two slides and a hinge for the object,
+a hinge for each finger. Fingers have inertia J about their joint (and their centre of mass on it, so that gravity acts
+on the object alone, as in eqs. 1-3), viscous friction B and dry friction D. No contact formation is assumed: all pairs
+of features that may touch (`contacts.every_contact`) are pairs of shapes that MuJoCo tests at every step. The shapes
+make MuJoCo's distances equal the C-functions:
+
+- an object vertex and a fingertip are dots, spheres of radius `r`, a hundred-thousandth of the object's;
+- the palm and a finger's contact edge are slabs whose face lies `r` behind the line, so that a dot whose centre is on
+  the line touches at gap 0; thick, so that no dot falls through, however soft the contact;
+- an object's edge, for the fingertips, is a wedge on that edge (likewise `r` behind it) with its point inside the
+  object. Wedges do not overlap, so that a concave object needs no decomposition. (MuJoCo keeps their corners in single
+  precision: a few nanometres.)
+
+A pair thus touches at one point of the plane. If `a_free` is the acceleration of the gap `C` without the contact, then
+
+    C_ddot = (1 - d) a_free - d (b C_dot + k C),    b = 2 / (d t_c),  k = 1 / (d t_c^2)        (`Softness`)
+
+critically damped, so that a steady load sags by `(1 - d) a_free t_c^2`. Friction obeys Coulomb's law with the link's
+coefficient (`coulomb`), or, much faster where many models are rolled out together, MuJoCo's convex one.
+"""
+
+# MuJoCo's names come from a compiled module, which type checkers cannot see into.
+# pyright: reportAttributeAccessIssue=false
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import mujoco
+import numpy as np
+from jaxtyping import Float, Int
+
+from wholearm_jax.model.contact_kinematics import every_contact
+from wholearm_jax.model.scene import EDGE, LINKS, VERTEX, Scene, body, contact_name, parse_contact
+
+DOT = 1e-5  # radius of a dot [object radii]: far above rounding, its lever arm far below any tolerance
+NEAR = 1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
+THICK = 0.2  # slabs, and all shapes in depth [object radii]
+
+
+@dataclass(frozen=True)
+class Softness:
+    """How contacts give way.
+
+    `time_constant` t_c of the gap is in time steps (MuJoCo resolves no fewer than two), `impedance` is d in (0, 1).
+    `friction` is Coulomb's law (`coulomb.advance`), for which the rest has no meaning, or MuJoCo's own, `"convex"`:
+    an elliptic cone in which slip dies out at the rate `b_f = 1 / (slip_constant * time step)` while friction holds;
+    `slip_stiffness` is MuJoCo's `impratio`.
+
+    Convex friction is Coulomb's only where slip is faster than `deceleration / b_f`; below that it fades out. An impact
+    at a speed `v_n` decelerates by about `v_n / t_c`: where slip is slower than `mu v_n slip_constant / time_constant`,
+    friction misses part of the impulse that Coulomb's law gives it. But the cone couples friction and gap: a contact
+    that slides at `v_t` is lifted by `mu b_f v_t / k`, against the sag above. Where the lift wins, the contact
+    chatters: the more so the harder it is (`d` near 1), the less load it bears, and the smaller `slip_constant`. And a
+    small `d` makes the steps unstable, because MuJoCo's estimate of the inertia that a contact feels leaves out the
+    other contacts: `d` = 0.4 was seen to be so at a `t_c` of two steps, not of three. `CONVEX` lies between.
+    """
+
+    time_constant: float = 3.0
+    impedance: float = 0.9
+    friction: Literal["coulomb", "convex"] = "coulomb"
+    slip_constant: float = 30.0
+    slip_stiffness: float = 100.0
+
+
+CONVEX = Softness(impedance=0.5, friction="convex")
+"""MuJoCo's own friction, at a compromise between chatter and missing impulses."""
+
+
+@dataclass(frozen=True)
+class FreeBodies:
+    """A compiled model, the names of its contacts, and what Coulomb's friction needs of both.
+
+    `pair[geom1, geom2]` is the row of `names` that two shapes belong to (-1: none); `toward[row]` is 1
+    where MuJoCo's contact normal points into the object and -1 where it points out of it. Each row has its `link` and
+    its `friction` coefficient; `joint` are the fingers' joints [m], and `mobility` is the diagonal of `M^-1`. `xml` is
+    the model as MJCF, always with MuJoCo's friction.
+    """
+
+    model: mujoco.MjModel
+    names: tuple[str, ...]
+    pair: Int[np.ndarray, "geoms geoms"]
+    toward: Int[np.ndarray, "rows"]
+    link: Int[np.ndarray, "rows"]
+    friction: Float[np.ndarray, "rows"]
+    joint: Float[np.ndarray, "2 2"]
+    mobility: Float[np.ndarray, "5"]
+    softness: Softness
+    xml: str
+
+
+def free_bodies(scene: Scene, timestep: float, softness: Softness = Softness()) -> FreeBodies:
+    """Build the model of a scene for time steps of `timestep` [s]."""
+    solid = jax.tree.map(np.asarray, body(scene.object))
+    size = float(np.sqrt((solid.vertices[: solid.count] ** 2).sum(1).max()))
+    spec = _world(scene, timestep, softness)
+    _add_object(spec, solid, size)
+    _add_hand(spec, scene.hand, size)
+    rows = _add_pairs(spec, solid, size, timestep, softness)
+    model = spec.compile()
+    if softness.friction == "coulomb":
+        model.pair_dim[:] = 1  # normal forces alone
+    pair = np.full((model.ngeom, model.ngeom), -1)
+    toward = np.ones(len(rows), int)
+    for row, ours, other in rows.values():
+        first, second = sorted((model.geom(ours).id, model.geom(other).id), key=lambda g: model.geom_type[g])
+        pair[first, second] = pair[second, first] = row
+        toward[row] = 1 if second == model.geom(ours).id else -1
+    link = np.array([parse_contact(name)[0] for name in rows])
+    inertia = np.array([solid.mass, solid.mass, solid.inertia, *np.asarray(scene.hand.inertia)])
+    return FreeBodies(
+        model=model,
+        names=tuple(rows),
+        pair=pair,
+        toward=toward,
+        link=link,
+        friction=np.asarray(solid.friction)[link],
+        joint=np.asarray(scene.hand.joint),
+        mobility=1 / inertia,
+        softness=softness,
+        xml=spec.to_xml(),
+    )
+
+
+def _world(scene, timestep, softness):
+    """Options: a Newton solver on elliptic cones, solved to rounding level; joint damping taken implicitly."""
+    spec = mujoco.MjSpec()
+    spec.modelname = scene.title
+    option = spec.option
+    option.timestep = timestep
+    option.gravity = [*np.asarray(scene.gravity), 0.0]
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.impratio = softness.slip_stiffness
+    option.tolerance, option.iterations = 1e-12, 50
+    option.ccd_tolerance = 1e-10
+    return spec
+
+
+def _add_body(spec, name, position, inertia, mass):
+    """A body with the inertia given about its own origin, whatever its shapes."""
+    added = spec.worldbody.add_body(name=name, pos=position)
+    added.explicitinertial, added.ipos = True, np.zeros(3)
+    added.mass, added.inertia = float(mass), np.full(3, float(inertia))
+    return added
+
+
+def _add_object(spec, solid, size):
+    """The object: slides, hinge, a dot on each vertex and a wedge on each edge."""
+    body_ = _add_body(spec, "object", [0, 0, 0], solid.inertia, solid.mass)
+    for name, kind, axis in (("x", "SLIDE", [1, 0, 0]), ("y", "SLIDE", [0, 1, 0]), ("phi", "HINGE", [0, 0, 1])):
+        body_.add_joint(name=name, type=getattr(mujoco.mjtJoint, f"mjJNT_{kind}"), axis=axis)
+    corners = solid.vertices[: solid.count]
+    for k, corner in enumerate(corners):
+        _add_geom(body_, f"v{k}", "SPHERE", [DOT * size, 0, 0], [*corner, 0])
+    for k, wedge in enumerate(_wedges(corners, DOT * size)):
+        points = [[*p, side * THICK * size / 2] for side in (-1, 1) for p in wedge]
+        spec.add_mesh(name=f"e{k}", uservert=np.ravel(points))
+        _add_geom(body_, f"e{k}", "MESH", [0, 0, 0], [0, 0, 0], meshname=f"e{k}")
+
+
+def _add_hand(spec, hand, size):
+    """The palm, and two fingers with a motor each; the tip is a dot at the end of the contact edge."""
+    left, right = float(hand.joint[1, 0]), float(hand.joint[0, 0])
+    thick, dot = THICK * size, DOT * size
+    _add_slab(spec.worldbody, "palm", left, right, -dot, -1.0, thick)
+    for k, (name, side) in enumerate(zip(LINKS[1:], (1.0, -1.0), strict=True)):
+        length, offset = float(hand.length[k]), float(hand.offset[k])
+        finger = _add_body(spec, name, [*np.asarray(hand.joint[k]), 0], hand.inertia[k], 1.0)
+        finger.add_joint(
+            name=f"theta{k + 1}",
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=[0, 0, 1],
+            damping=[float(hand.viscous[k]), 0, 0],
+            frictionloss=float(hand.dry[k]),
+            # Dry friction is as stiff as MuJoCo makes it: the joint creeps least where it should stand.
+            solref_friction=[2 * spec.option.timestep, 1.0],
+            solimp_friction=[0.999, 0.999, 1e-3, 0.5, 2],
+        )
+        _add_slab(finger, name, 0.0, length, side * offset - side * dot, -side, thick)
+        _add_geom(finger, f"{name}_tip", "SPHERE", [dot, 0, 0], [length, side * offset, 0])
+        motor = spec.add_actuator(name=name, target=f"theta{k + 1}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.gainprm[0], motor.biastype = 1.0, mujoco.mjtBias.mjBIAS_NONE
+
+
+def _add_slab(owner, name, start, end, face, away, thick):
+    """A box along x from `start` to `end`, its face at `y = face`, its body on the side `away` of it."""
+    _add_geom(
+        owner, name, "BOX", [(end - start) / 2, thick / 2, thick / 2], [(start + end) / 2, face + away * thick / 2, 0]
+    )
+
+
+def _add_geom(owner, name, kind, size, position, **more):
+    """A shape that touches only what `_add_pairs` says."""
+    shape = getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")
+    owner.add_geom(name=name, type=shape, size=size, pos=position, contype=0, conaffinity=0, **more)
+
+
+def _add_pairs(spec, solid, size, timestep, softness):
+    """Declare all pairs that may touch; name -> (row, the object's shape, the hand's shape)."""
+    pairs, rows = every_contact(len(solid.vertices)), {}
+    columns = (np.asarray(a).tolist() for a in (pairs.link, pairs.kind, pairs.feature))
+    d, b = softness.impedance, 1 / (softness.slip_constant * timestep)
+    for link, kind, feature in zip(*columns, strict=True):
+        if feature >= solid.count:
+            continue
+        ours = f"{'v' if kind == VERTEX else 'e'}{feature}"
+        other = LINKS[link] + ("_tip" if kind == EDGE else "")
+        name = contact_name(link, kind, feature)
+        rows[name] = len(rows), ours, other
+        spec.add_pair(
+            name=name,
+            geomname1=ours,
+            geomname2=other,
+            condim=3,
+            margin=NEAR * size,
+            friction=[float(solid.friction[link])] * 2 + [0, 0, 0],
+            solref=[softness.time_constant * timestep, 1.0],
+            solreffriction=[0.0, -b * d],
+            solimp=[d, d, 1e-3, 0.5, 2],
+        )
+    return rows
+
+
+def _wedges(corners, behind):
+    """Triangles `(edges, 3, 2)` on an object's edges, `behind` them, with their points inside and free of each other.
+
+    The point stands over the edge's middle, below both ends' bisectors and clear of every other corner.
+    """
+    after, count = np.roll(corners, -1, 0), len(corners)
+    along = after - corners
+    length = np.hypot(*along.T)
+    along = along / length[:, None]
+    inward = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    turn = np.arctan2(np.sum(inward * np.roll(along, -1, 0), 1), np.sum(along * np.roll(along, -1, 0), 1))
+    end = np.minimum((np.pi - turn) / 2, 1.0)  # half the inner angle at each edge's end
+    half = np.minimum(end, np.roll(end, 1))
+    height = 0.5 * np.tan(half) * length / 2
+    for k in range(count):
+        others = np.delete(corners, [k, (k + 1) % count], axis=0) - corners[k]
+        over = (others @ inward[k] > 0) & (others @ along[k] >= 0) & (others @ along[k] <= length[k])
+        height[k] = min([height[k], *(0.5 * others[over] @ inward[k])])
+    base = behind * inward
+    middle = (corners + after) / 2
+    return np.stack([corners + base, after + base, middle + height[:, None] * inward], axis=1)

@@ -1,0 +1,200 @@
+r"""Perturb: a plan executed many times with friction, mass, geometry and start a little off, and how often it succeeds.
+
+Every draw is uniform within plus or minus its amount: a factor on each link's friction coefficient, one on the mass
+(and with it the inertia), a shift of each coordinate of each vertex, and a shift of the object's start in x, y and, by
+that over its radius, phi. The object that is then laid in the hand touches as the first formation says: the start is
+the nearest configuration at which the perturbed object's gaps are 0 (least-norm Newton steps in object units). The
+torques stay those of the unperturbed plan, and so does the end that counts as success.
+"""
+
+# MuJoCo's names come from a compiled module, which type checkers cannot see into.
+# pyright: reportAttributeAccessIssue=false
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from joblib import Parallel, delayed
+
+from wholearm_jax.core.validation import require_positive
+from wholearm_jax.ensembles.proportion import wilson
+from wholearm_jax.execution.mujoco_model import FreeBodies, Softness, free_bodies
+from wholearm_jax.execution.rollout import (
+    Ending,
+    Tolerance,
+    clock,
+    follow,
+    judge,
+    motor_torques,
+    require_wires,
+    start_of,
+    target_of,
+)
+from wholearm_jax.model.contact_kinematics import gaps, normal_rows
+from wholearm_jax.model.mechanics import system
+from wholearm_jax.model.polygon import stays_simple
+from wholearm_jax.model.scene import Formation, Scene, body
+from wholearm_jax.phases.result import Result
+
+
+class Amounts(NamedTuple):
+    """Half widths of the uniform draws: `friction` and `mass` relative, `geometry` and `start` in metres."""
+
+    friction: float = 0.0
+    mass: float = 0.0
+    geometry: float = 0.0
+    start: float = 0.0
+
+
+@dataclass(frozen=True)
+class Perturbed:
+    """One execution: factors and shifts drawn, where the object ended, and what that counts as."""
+
+    friction: Float[np.ndarray, "3"]
+    mass: float
+    end: Float[np.ndarray, "5"]
+    position_error: float
+    angle_error: float
+    ending: Ending
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """Many perturbed executions; `interval` is the success rate's 95 % confidence interval (Wilson's)."""
+
+    amounts: Amounts
+    seed: int
+    tolerance: Tolerance
+    runs: tuple[Perturbed, ...]
+
+    @property
+    def successes(self) -> int:
+        return sum(run.ending is Ending.OK for run in self.runs)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        return wilson(self.successes, len(self.runs))
+
+    @property
+    def message(self) -> str:
+        """The success rate in one line."""
+        low, high = self.interval
+        share = 100 * self.successes / len(self.runs)
+        span = f"95 % confidence interval {100 * low:.1f} to {100 * high:.1f} %"
+        return f"{self.successes} of {len(self.runs)} perturbed executions succeed: {share:.1f} %, {span}"
+
+
+def perturb(
+    prediction: Result,
+    count: int,
+    amounts: Amounts,
+    *,
+    seed: int = 0,
+    timestep: float = 2e-4,
+    softness: Softness = Softness(),
+    tolerance: Tolerance = Tolerance(),
+    workers: int | None = None,
+    callback: Callable[[Perturbed], None] | None = None,
+) -> Robustness:
+    """Execute `count` perturbed copies of a plan in `workers` processes (default: one for each processor).
+
+    `callback` sees each as it is done, in their order. Raises ValueError as `require_wires` and `require_objects` do,
+    and for numbers that are not positive.
+    """
+    require_positive(count=count, timestep=timestep)
+    require_wires(prediction)
+    require_objects(prediction.scene, amounts)
+    rng = np.random.default_rng(seed)
+    scenes = [_perturbed(prediction.scene, amounts, rng) for _ in range(count)]
+    shifts = rng.uniform(-1, 1, (count, 3)) * amounts.start
+    begins, step = clock(prediction.scene, timestep)
+    torques = motor_torques(prediction.torque, begins, step)
+    nominal, target = start_of(prediction), target_of(prediction)
+
+    def copies():
+        for scene, shift in zip(scenes, shifts, strict=True):
+            yield free_bodies(scene, step, softness), start_near(scene, nominal, shift)
+
+    found = roll_out(copies(), torques, min(workers or os.cpu_count() or 1, count))
+    runs = []
+    for scene, (end, creep) in zip(scenes, found, strict=True):
+        ending, _ = judge(scene, end, target, tolerance, creep)
+        runs.append(_summary(prediction.scene, scene, end, target, ending))
+        if callback is not None:
+            callback(runs[-1])
+    return Robustness(amounts, seed, tolerance, tuple(runs))
+
+
+def require_objects(scene: Scene, amounts: Amounts) -> None:
+    """Raise ValueError for amounts by which what is drawn may be no object."""
+    if not 0 <= amounts.friction <= 1 or not 0 <= amounts.mass < 1:
+        raise ValueError("friction, mass: shares of up to 1, of the mass less than 1")
+    outline = np.asarray(scene.object.vertices)[: int(scene.object.count)]
+    if not stays_simple(outline, np.full(len(outline), np.sqrt(2) * amounts.geometry)):
+        raise ValueError(f"geometry {amounts.geometry:g}: too much, edges of the polygon could cross")
+
+
+def _perturbed(scene: Scene, amounts: Amounts, rng: np.random.Generator) -> Scene:
+    """The scene with another object. Everything is drawn whatever the amounts, so that each keeps its own sequence."""
+    shape = scene.object
+    friction = 1 + amounts.friction * rng.uniform(-1, 1, 3)
+    mass = 1 + amounts.mass * rng.uniform(-1, 1)
+    shift = amounts.geometry * rng.uniform(-1, 1, shape.vertices.shape)
+    shift[int(shape.count) :] = shift[int(shape.count) - 1]  # padding repeats the last vertex
+    changed = eqx.tree_at(
+        lambda s: (s.friction, s.mass, s.vertices),
+        shape,
+        (shape.friction * friction, shape.mass * mass, shape.vertices + shift),
+    )
+    if shape.inertia is not None:
+        changed = eqx.tree_at(lambda s: s.inertia, changed, shape.inertia * mass)
+    return eqx.tree_at(lambda s: s.object, scene, changed)
+
+
+def start_near(scene: Scene, z, shift) -> Float[np.ndarray, "5"]:
+    """The configuration next to `z`, its object displaced by `shift` [m], at which the first formation's gaps are 0."""
+    return np.asarray(_touch_down(scene.object, scene.hand, scene.gravity, scene.phases[0].formation, z, shift))
+
+
+@jax.jit
+def _touch_down(shape, hand, gravity, formation: Formation, z, shift) -> Float[Array, "5"]:
+    mechanics = system(body(shape), hand, gravity, formation)
+    displaced = z / mechanics.configuration_unit + jnp.zeros(5).at[:3].set(shift / mechanics.length)
+
+    def closer(_, z):
+        rows = normal_rows(mechanics.contacts, z)
+        return z - rows.T @ jnp.linalg.solve(rows @ rows.T, gaps(mechanics.contacts, z))
+
+    return jax.lax.fori_loop(0, 20, closer, displaced) * mechanics.configuration_unit
+
+
+def roll_out(
+    copies: Iterable[tuple[FreeBodies, Float[np.ndarray, "5"]]], torques, workers: int
+) -> Iterator[tuple[Float[np.ndarray, "5"], float]]:
+    """Where free bodies end, driven from rest at their starts, and how far contacts crept (`execution.follow`)."""
+    each = (delayed(_end)(bodies, start, torques) for bodies, start in copies)
+    return Parallel(n_jobs=workers, return_as="generator")(each)  # pyright: ignore[reportReturnType]
+
+
+def _end(bodies: FreeBodies, start, torques) -> tuple[Float[np.ndarray, "5"], float]:
+    z, _, _, creep = follow(bodies, start, torques)
+    return z[-1], creep
+
+
+def _summary(scene: Scene, changed: Scene, end, target, ending: Ending) -> Perturbed:
+    off = end - target
+    was, now = (np.asarray(one.object.friction) for one in (scene, changed))
+    return Perturbed(
+        friction=np.where(was > 0, now / np.where(was > 0, was, 1.0), 1.0),
+        mass=float(changed.object.mass / scene.object.mass),
+        end=end,
+        position_error=float(np.hypot(*off[:2])),
+        angle_error=float(off[2]),
+        ending=ending,
+    )

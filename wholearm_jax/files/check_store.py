@@ -1,0 +1,130 @@
+"""Keep: results of checks in a Zarr (version 3) store, one chunk of scenes after the other.
+
+A chunk of every array is one file, written whole by one process; the chunk's entry in `done` is written last. Whoever
+is stopped, at any moment, leaves a store that can be read, and whoever opens it again goes on with the chunks that are
+not done. The store says what it is of (`identity`): another scene, schedule, seed, setting or version is refused.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import zarr
+from zarr.errors import GroupNotFoundError
+
+from wholearm_jax.ensembles.batch import Checked
+
+KIND = "wholearm_jax check"
+# Status, contact and phase numbers are small; -1 marks "none".
+TYPES = {"status": "int8", "margin": "float64", "time": "float64", "contact": "int8", "phase": "int8", "end": "float64"}
+
+
+class StoreError(Exception):
+    """A store cannot be used; the message is one line."""
+
+
+def fingerprint(*trees: Any) -> str:
+    """A digest of every number, name and structure in pytrees."""
+    digest = hashlib.sha256()
+    for tree in trees:
+        leaves, structure = jax.tree.flatten(tree)
+        digest.update(str(structure).encode())
+        for leaf in leaves:
+            array = np.asarray(leaf)
+            digest.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
+
+
+class Store:
+    """Results of `count` scenes in chunks of `chunk`; with `torques`, a schedule of that many rows a scene."""
+
+    def __init__(self, path: Path, group: zarr.Group, count: int, chunk: int):
+        self.path, self.group, self.count, self.chunk = path, group, count, chunk
+
+    @property
+    def chunks(self) -> int:
+        """How many chunks there are."""
+        return -(-self.count // self.chunk)
+
+    def done(self) -> np.ndarray:
+        """Which chunks are complete."""
+        return np.asarray(self.array("done")[:]).astype(bool)
+
+    def array(self, name: str) -> zarr.Array:
+        """One of the arrays, on disk."""
+        array = self.group[name]
+        assert isinstance(array, zarr.Array)
+        return array
+
+    def rows(self, number: int) -> slice:
+        """The rows of a chunk."""
+        return slice(number * self.chunk, min(self.count, (number + 1) * self.chunk))
+
+    def write(self, number: int, values: Mapping[str, np.ndarray]) -> None:
+        """Write a chunk of every array, and then that it is done."""
+        try:
+            for name, column in values.items():
+                array = self.array(name)
+                array[self.rows(number)] = np.asarray(column).astype(array.dtype)
+            self.array("done")[number] = 1
+        except OSError as error:
+            raise StoreError(f"{self.path}: cannot be written: {error.strerror or error}") from None
+
+    def read(self, number: int) -> Checked:
+        """A chunk's results."""
+        return Checked(*(np.asarray(self.array(name)[self.rows(number)]) for name in Checked._fields))
+
+
+def identity(count: int, chunk: int, **settings: Any) -> dict[str, Any]:
+    """What a store is of: numbers and settings that JSON can hold, and the package's version."""
+    whole = {"kind": KIND, "version": version("wholearm_jax"), "jax": version("jax"), "count": count, "chunk": chunk}
+    return json.loads(json.dumps(whole | settings))
+
+
+def open_store(path: Path, wanted: Mapping[str, Any], torques: int = 0) -> Store:
+    """Open a store to go on with, or make it. Raises `StoreError` for a path that holds something else."""
+    try:
+        group = zarr.open_group(str(path), mode="r+")
+    except (FileNotFoundError, GroupNotFoundError):
+        return _made(path, wanted, torques)
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path}: not a store: {error}") from None
+    held = dict(group.attrs).get("identity")
+    if held is None and not group.attrs and {*group.keys()} <= {*TYPES, "torque", "done"}:
+        return _made(path, wanted, torques, again=True)
+    if not isinstance(held, Mapping) or held.get("kind") != KIND:
+        raise StoreError(f"{path}: holds something else than a check")
+    other = sorted(key for key in {*held, *wanted} if held.get(key) != wanted.get(key))
+    if other:
+        raise StoreError(f"{path}: is of another {', '.join(other)}; give another --out, or the same command")
+    return Store(path, group, int(wanted["count"]), int(wanted["chunk"]))
+
+
+def _made(path: Path, wanted: Mapping[str, Any], torques: int, again: bool = False) -> Store:
+    """A new store. What it is of is written last, so that one that was left half made is made `again`."""
+    if not again and path.exists() and (not path.is_dir() or any(p.suffix != ".partial" for p in path.iterdir())):
+        raise StoreError(f"{path}: exists and is not a store")
+    count, chunk = int(wanted["count"]), int(wanted["chunk"])
+    try:
+        group = zarr.create_group(str(path), overwrite=True)
+        for name, kind in TYPES.items():
+            fill = np.nan if kind == "float64" else -1
+            _add(group, name, kind, fill, (count, 5) if name == "end" else (count,), chunk)
+        if torques:
+            _add(group, "torque", "float64", np.nan, (count, torques, 3), chunk)
+        _add(group, "done", "uint8", 0, (-(-count // chunk),), 1)
+        group.attrs["identity"] = dict(wanted)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from None
+    return Store(path, group, count, chunk)
+
+
+def _add(group: zarr.Group, name: str, kind: str, fill, shape: tuple[int, ...], chunk: int) -> None:
+    """An array cut into chunks along its first axis."""
+    chunks = (min(chunk, shape[0]), *shape[1:])
+    group.create_array(name, shape=shape, chunks=chunks, dtype=kind, fill_value=fill)

@@ -1,0 +1,351 @@
+r"""Score: the compressive margin of a motion, exact in time, and the smooth minimum that is optimised.
+
+What counts toward the margin [N] is the slack of each constraint's force: `c_n` itself, and `mu c_n - |c_t|`, how far
+inside its friction cone the force is, in the tangential row of a contact that rolls.
+
+Between accepted steps `s(u)` is the quintic with the right `s`, `ds/du` and `d2s/du2` at both ends, so that forces are
+known at every time, not only at steps. The margin is the least slack over continuous time and all contacts: samples
+find its neighbourhood, golden section its place. Its derivative is that of the force at the place found (the envelope
+theorem), landings and knots included.
+
+Derivation: section 7 of `docs/derivation.md`.
+"""
+
+import math
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
+
+from wholearm_jax.core.lookup import pick
+from wholearm_jax.dynamics.path_dynamics import Table, combined, derivative, polynomial, powers
+from wholearm_jax.model.schedule import Window, torque_in
+from wholearm_jax.simulation.event_step import acceleration, single_step
+from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.phase_motion import Motion
+
+SAMPLES = 7  # places in a step at which forces are sampled before the minimum is refined
+MOST_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
+REFINED = 4  # dips refined: those that parabolas through samples put lowest
+FEW = 16  # steps sampled together
+GOLDEN = 17  # sections to a dip: Newton's step on the true motion follows
+
+
+class Score(NamedTuple):
+    """The least slack of a phase: `margin` [N], its time as a share of the phase, its `s` and the number of its row in
+    the formation, `contact`.
+
+    `lost` is the share at which a contact first pulls or slips (infinite if none does), `lost_contact` its row.
+    """
+
+    margin: Float[Array, ""]
+    share: Float[Array, ""]
+    s: Float[Array, ""]
+    contact: Int[Array, ""]
+    lost: Float[Array, ""]
+    lost_contact: Int[Array, ""]
+
+
+class Arcs(eqx.Module):
+    """The steps of a motion as quintics: everything that forces within step `i` depend on."""
+
+    share: Float[Array, "steps 2"]
+    quintic: Float[Array, "steps 6"]
+    piece: Int[Array, "steps"]
+    row: Int[Array, "steps"]
+    held: Bool[Array, "steps"]
+    live: Bool[Array, "steps"]
+
+
+def arcs(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion) -> Arcs:
+    """The steps of a motion as arcs."""
+    # A step that takes no time has no speed of its own: its neighbours hold what is before it and behind.
+    live = (jnp.arange(motion.held.shape[0]) < motion.count) & (motion.share[1:] > motion.share[:-1])
+    share, s = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (motion.share, motion.s))
+    w = jnp.stack([motion.entry_w, motion.w[1:]], axis=1)
+    each = jax.vmap(arc, (None, None, None, 0, 0, 0, 0, 0, 0))
+    quintic = each(table, seen, duration, share, s, w, motion.piece, motion.row, live & ~motion.held)
+    return Arcs(share, quintic, motion.piece, motion.row, motion.held, live)
+
+
+def arc(table: Table, seen: Window, duration, share, s, w, piece, row, moving) -> Float[Array, "6"]:
+    """The quintic Hermite arc in `xi` in [0, 1] between a step's two ends; `s` stays where nothing moves."""
+    width = share[1] - share[0]
+    bend = jax.vmap(acceleration, (None, None, None, None, None, 0, 0, 0))(
+        table, seen, duration, piece, row, share, s, w
+    )
+    d0, d1 = jnp.where(moving, w * width, 0.0)
+    b0, b1 = jnp.where(moving, bend * width**2, 0.0)
+    rise = s[1] - s[0]
+    # A step as short as the rounding of `s`, as across a tiny piece, would take its speed from that rounding.
+    even = (d0 + d1) / 2 + (b0 - b1) / 12
+    rise = jnp.where(jnp.abs(rise - even) < 8 * jnp.finfo(rise.dtype).eps * jnp.abs(s[1]), even, rise)
+    quintic = [
+        s[0],
+        d0,
+        b0 / 2,
+        10 * rise - 6 * d0 - 4 * d1 - 1.5 * b0 + b1 / 2,
+        -15 * rise + 8 * d0 + 7 * d1 + 1.5 * b0 - b1,
+        6 * rise - 3 * (d0 + d1) - (b0 - b1) / 2,
+    ]
+    return jnp.stack(quintic)
+
+
+def on_arc(one: Arcs, xi: Float[Array, ""]):
+    """Share, `s` and `w` at `xi` of one arc (no leading axis)."""
+    width = one.share[1] - one.share[0]
+    s = polynomial(one.quintic, xi)
+    slope = polynomial(derivative(one.quintic), xi)
+    moving = one.live & ~one.held
+    return one.share[0] + xi * width, s, jnp.where(moving, slope / jnp.where(moving, width, 1.0), 0.0)
+
+
+def force(table: Table, seen: Window, duration, piece, row, share, s, w) -> Float[Array, "slots"]:
+    """Constraint forces [N] for forward travel: `c_n`, and `c_t` in tangential rows."""
+    panel, xi = powers(table, piece, s)
+    v = w / duration
+    rest = jnp.stack([jnp.ones_like(v), v**2, v])
+    return combined(table.force, panel, xi, jnp.concatenate([rest, torque_in(seen, row, share)]))
+
+
+def slack(table: Table, forces: Float[Array, "slots"]) -> Float[Array, "slots"]:
+    """What of constraint forces counts toward the margin [N]: `c_n`, and `mu c_n - |c_t|` in tangential rows."""
+    cone = table.grip * jnp.roll(forces, 1) - jnp.abs(forces)  # a contact's normal row stands before its tangential one
+    return jnp.where(table.tangential, cone, forces)
+
+
+def linear_slacks(
+    table: Table, forces: Float[Array, "slots *terms"], rolling: int = MOST_ROLLING
+) -> Float[Array, "rows *terms"]:
+    """Linear functions of the forces whose least is the least `slack`: both sides of each friction cone.
+
+    `forces` may be coefficients, by any linear terms. Four constraints have at most two tangential rows, and so there
+    are six of these, fewer where it is known that no more than `rolling` roll; those not needed (`spare`) repeat the
+    first.
+    """
+    column = (slice(None), *(None,) * (forces.ndim - 1))
+    normal = table.grip[column] * jnp.roll(forces, 1, axis=0)
+    one_side = jnp.where(table.tangential[column], normal - forces, forces)
+    (rows,) = jnp.nonzero(table.tangential, size=rolling, fill_value=-1)
+    other = jnp.where((rows >= 0)[column], (normal + forces)[rows], forces[0])
+    return jnp.concatenate([one_side, other])
+
+
+def spare(table: Table) -> Bool[Array, "rows"]:
+    """Which of `linear_slacks` repeat another."""
+    slots = table.tangential.shape[0]
+    return jnp.arange(slots + MOST_ROLLING) >= slots + table.tangential.sum()
+
+
+def slacks_on(table: Table, seen: Window, duration, arc: Arcs, xi, kind=slack) -> Float[Array, "rows"]:
+    """`slack` (or `linear_slacks`) at `xi` of one arc."""
+    share, s, w = on_arc(arc, xi)
+    return kind(table, force(table, seen, duration, arc.piece, arc.row, share, s, w))
+
+
+def sampled_slacks(
+    table: Table, seen: Window, duration, steps: Arcs, samples: int = SAMPLES, kind=slack
+) -> Float[Array, "steps samples rows"]:
+    """`slack` (or `linear_slacks`) at evenly spaced places of every step, ends included; infinite where all rests."""
+    xi = jnp.linspace(0.0, 1.0, samples, dtype=steps.quintic.dtype)
+    on = partial(slacks_on, kind=kind)
+    at = jax.vmap(jax.vmap(on, (None, None, None, None, 0)), (None, None, None, 0, None))
+    values = at(table, seen, duration, steps, xi)
+    return jnp.where((steps.live & ~steps.held)[:, None, None], values, jnp.inf)
+
+
+def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion, how: Integration) -> Score:
+    """The margin of a simulated phase.
+
+    The quintics find the place; the force there comes from one step of the solver that ends beside it, so that the
+    margin is as accurate as the integration.
+    """
+    steps = arcs(table, seen, duration, motion)
+    values = _values(*stop_gradient((table, seen, duration, steps)), motion.count)
+
+    def at(number):
+        """What a dip in a step depends on, and its place as (step, contact)."""
+        step, contact = number // values.shape[2], number % values.shape[2]
+        arc = jax.tree.map(lambda a: pick(a, step), steps)
+        return (table, seen, duration, arc, pick(motion.entry_w, step)), step, contact
+
+    def find(number):
+        """How low a dip goes, and where."""
+        inputs, step, contact = stop_gradient(at(number))
+        seat, reach = jnp.argmin(pick(pick(values, step).T, contact)) / (SAMPLES - 1), 1.0 / (SAMPLES - 1)
+        low, high = jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0)
+        xi = _minimise(lambda xi: pick(slacks_on(*inputs[:4], xi), contact), low, high)
+        return _dip(inputs, how, contact, xi, low, high)
+
+    numbers = _lowest(_dips(values).ravel(), REFINED)
+    least, places = stop_gradient(jax.vmap(find)(numbers))
+    best = jnp.argmin(least)
+    inputs, _, contact = at(pick(numbers, best))
+    xi = pick(places, best)
+    margin = _carried(inputs, how, contact, xi, pick(least, best))
+    share, s, _ = on_arc(inputs[3], xi)
+    lost, lost_contact = _first_loss(*stop_gradient((table, seen, duration, steps)), values)
+    between = (margin < 0) & ~jnp.isfinite(lost)  # a dip that no sample shows
+    lost = jnp.where(between, stop_gradient(share), lost)
+    lost_contact = jnp.where(between, contact, lost_contact)
+    return Score(margin, share, s, contact, lost, lost_contact)
+
+
+def _values(table, seen, duration, steps: Arcs, count) -> Float[Array, "steps samples rows"]:
+    """`sampled_slacks` of the first `count` steps, few at a time: there is room for many more."""
+    rows = steps.live.shape[0]
+    few = min(FEW, rows)
+
+    def sample(k, values):
+        first = jnp.minimum(k * few, rows - few)
+        block = jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, first, few), steps)
+        fresh = sampled_slacks(table, seen, duration, block)
+        return jax.lax.dynamic_update_slice_in_dim(values, fresh, first, 0)
+
+    none = jnp.full((rows, SAMPLES, table.tangential.shape[0]), jnp.inf, steps.quintic.dtype)
+    return jax.lax.fori_loop(0, (count + few - 1) // few, sample, none)
+
+
+def _lowest(values: Float[Array, "n"], count: int) -> Int[Array, "count"]:
+    """The numbers of the lowest values, one after the other: sorting them all takes longer."""
+
+    def take(values, _):
+        lowest = jnp.argmin(values)
+        return values.at[lowest].set(jnp.inf), lowest
+
+    return jax.lax.scan(take, stop_gradient(values), length=count)[1]
+
+
+def smooth_margin(values, weights, temperature: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    r"""The smooth loss's counterpart of `min values`: `phi = max_m [ m + T sum_i w_i log((values_i - m) / T) ]`.
+
+    `T` is the temperature [N] and `w` non-negative weights; `m`, returned second, solves
+    `sum_i T w_i / (values_i - m) = 1` and lies between `min - T sum(w)` and `min`. `phi` is concave in the values and
+    its gradient `T w_i / (values_i - m)`
+    sums to one. Entries of zero weight are left out.
+    """
+    live = stop_gradient(weights) > 0
+    values = jnp.where(live, values, 0.0)
+    fixed = stop_gradient(values)
+    low = jnp.where(live, fixed, jnp.inf).min()
+    heaviest = jnp.where(live & (fixed <= low), weights, 0.0).max()
+
+    def step(at):
+        m, _, count = at
+        room = jnp.where(live, fixed - m, 1.0)
+        over = temperature * (weights / room).sum() - 1.0
+        move = over / (temperature * (weights / room**2).sum())
+        return m - move, jnp.abs(move), count + 1
+
+    def going(at):
+        m, moved, count = at
+        return (count < 40) & (moved > 4 * jnp.finfo(m.dtype).eps * (jnp.abs(m) + temperature))
+
+    begin = stop_gradient(low - temperature * heaviest)
+    m, *_ = jax.lax.while_loop(going, step, (begin, jnp.full_like(begin, jnp.inf), 0))
+    m = stop_gradient(m)
+    return m + temperature * (weights * jnp.log(jnp.where(live, values - m, 1.0) / temperature)).sum(), m
+
+
+def _dips(values: Float[Array, "steps samples rows"]) -> Float[Array, "steps rows"]:
+    """About how low each slack goes in each step: the least of its samples and of the parabola about it."""
+    least, seat = values.min(1), jnp.clip(jnp.argmin(values, axis=1), 1, values.shape[1] - 2)
+    before, here, after = (jnp.take_along_axis(values, (seat + k)[:, None], axis=1)[:, 0] for k in (-1, 0, 1))
+    slope, bend = (after - before) / 2, before - 2 * here + after
+    vertex = jnp.clip(-slope / jnp.where(bend > 0, bend, jnp.inf), -1.0, 1.0)
+    lowest = here + vertex * (slope + vertex * bend / 2)
+    return jnp.where(jnp.isfinite(least), jnp.minimum(least, lowest), jnp.inf)
+
+
+def _dip(inputs, how: Integration, contact, xi, low, high):
+    """A constraint's least slack about `xi` of a step of the true motion, and where in `[low, high]` that is.
+
+    To second order: the value and slope where a step of the solver ends at `xi`, the second derivative that of the
+    quintic. The derivative, the place held, is that at the true minimum.
+    """
+    table, seen, duration, arc, entry_w = inputs
+    width = arc.share[1] - arc.share[0]
+    share, begin = arc.share[0] + xi * width, jnp.stack([arc.quintic[0], entry_w])
+    s, w = single_step(table, seen, duration, how, arc.piece, arc.row, arc.share[0], begin, xi * width)
+
+    def at(share, s, w):
+        return pick(slack(table, force(table, seen, duration, arc.piece, arc.row, share, s, w)), contact)
+
+    bend = acceleration(table, seen, duration, arc.piece, arc.row, share, s, w)
+    value, slope = jax.jvp(at, (share, s, w), (jnp.ones_like(share), w, bend))
+    wide = jnp.where(width > 0, width, 1.0)
+    curve = _second(lambda xi: pick(slacks_on(table, seen, duration, arc, xi), contact), xi) / wide**2
+    inner = (xi > 0) & (xi < 1) & (curve > 0)
+    better = jnp.clip(xi - jnp.where(inner, slope / jnp.where(inner, curve, 1.0) / wide, 0.0), low, high)
+    way = stop_gradient((better - xi) * width)
+    least = value + slope * way + stop_gradient(curve) * way**2 / 2
+    return jnp.where(arc.live & ~arc.held, least, jnp.inf), better
+
+
+@eqx.filter_custom_jvp
+def _carried(inputs, how, contact, xi, least):
+    """The `least` slack that was found at `xi`, with the derivatives of `_dip`."""
+    return least
+
+
+@_carried.def_jvp
+def _(primals, tangents):
+    (inputs, how, contact, xi, least), (change, *_) = primals, tangents
+    _, rate = eqx.filter_jvp(lambda inputs: _dip(inputs, how, contact, xi, 0.0, 1.0)[0], (inputs,), (change,))
+    return least, rate
+
+
+def _second(function, x):
+    """The second derivative."""
+    along = jnp.ones_like(x)
+    return jax.jvp(lambda x: jax.jvp(function, (x,), (along,))[1], (x,), (along,))[1]
+
+
+def _minimise(function, low, high):
+    """About the least point of `function` in `[low, high]`, by golden section.
+
+    A bracket's end counts where it is lower.
+    """
+    golden = (math.sqrt(5) - 1) / 2
+
+    def narrow(k, state):
+        """Both ends first, then the two inner points; each round keeps the part that holds the lower one."""
+        low, high, best, least = state
+        width = high - low
+        points = jnp.where(k == 0, jnp.stack([low, high]), jnp.stack([high - golden * width, low + golden * width]))
+        values = jax.vmap(function)(points)
+        lower = jnp.argmin(values)
+        better = values[lower] < least
+        low = jnp.where((k > 0) & (lower == 1), points[0], low)
+        high = jnp.where((k > 0) & (lower == 0), points[1], high)
+        return low, high, jnp.where(better, points[lower], best), jnp.minimum(values[lower], least)
+
+    start = (low, high, low, jnp.full_like(low, jnp.inf))
+    return stop_gradient(jax.lax.fori_loop(0, GOLDEN, narrow, start)[2])
+
+
+def _first_loss(table, seen, duration, steps, values):
+    """The share at which a contact's slack first turns negative, by bisection from the first sample that is."""
+    negative = (values < 0).any(2)  # their least would go to a library of XLA's, with threads of its own
+    first = jnp.argmax(negative.ravel())
+    step, sample = first // SAMPLES, first % SAMPLES
+    arc = jax.tree.map(lambda a: pick(a, step), steps)
+    width = 1.0 / (SAMPLES - 1)
+    high = sample * width
+
+    def halve(_, bracket):
+        low, high, contact = bracket
+        middle = (low + high) / 2
+        slacks = slacks_on(table, seen, duration, arc, middle)
+        gone = slacks.min() < 0
+        contact = jnp.where(gone, jnp.argmin(slacks), contact)
+        return jnp.where(gone, low, middle), jnp.where(gone, middle, high), contact
+
+    bracket = (jnp.maximum(high - width, 0.0), high, jnp.argmin(values[step, sample]))
+    _, xi, contact = jax.lax.fori_loop(0, jnp.where(jnp.any(negative), 50, 0), halve, bracket)
+    share = on_arc(arc, xi)[0]
+    return jnp.where(jnp.any(negative), share, jnp.inf), contact

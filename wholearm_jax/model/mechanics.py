@@ -1,0 +1,125 @@
+"""One formation's mechanics in the object's own units, so that no result depends on the choice of metre or kilogram.
+
+Length unit: the largest distance of a vertex from the centre of mass. Mass unit: the object's mass. Time stays in
+seconds. Angles and `z = (x, y, phi, theta1, theta2)` are then all of order one.
+
+Derivation: section 2 of `docs/derivation.md`.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from wholearm_jax.model.contact_kinematics import Contacts, contacts, every_meeting
+from wholearm_jax.model.scene import EDGE, VERTEX, Body, Formation, Hand, next_vertex
+
+
+class System(eqx.Module):
+    """A formation on a hand, dimensionless but for time.
+
+    `inertia` is the diagonal of `M = diag(m, m, I, J1, J2)`; `viscous` and `dry` are B and D; `gravity` is an
+    acceleration. `candidates` are all pairs that may touch, `real` those of features that the object has; `watched`
+    marks those that could end the formation, `behind` vertices that may lie behind a link, whose back stops them.
+    `length` [m] and `mass` [kg] are the units; `torque_limit` stays in N m.
+    """
+
+    contacts: Contacts
+    candidates: Contacts
+    real: Bool[Array, "candidates"]
+    watched: Bool[Array, "candidates"]
+    behind: Bool[Array, "candidates"]
+    inertia: Float[Array, "5"]
+    viscous: Float[Array, "2"]
+    dry: Float[Array, "2"]
+    gravity: Float[Array, "2"]
+    length: Float[Array, ""]
+    mass: Float[Array, ""]
+    torque_limit: Float[Array, "2"]
+
+    @property
+    def configuration_unit(self) -> Float[Array, "5"]:
+        """What one unit of each coordinate of `z` is in metres or radians."""
+        return configuration_unit(self.length)
+
+    @property
+    def torque_unit(self) -> Float[Array, ""]:
+        """What one unit of torque is in N m, for times in seconds."""
+        return self.mass * self.length**2
+
+    @property
+    def force_unit(self) -> Float[Array, ""]:
+        """What one unit of force is in N, for times in seconds."""
+        return self.mass * self.length
+
+
+def configuration_unit(length: Float[Array, ""]) -> Float[Array, "5"]:
+    """`z` in SI units is `z` in object units times this."""
+    one = jnp.ones_like(length)
+    return jnp.stack([length, length, one, one, one])
+
+
+def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Formation) -> System:
+    """Scale a formation by the object's size and mass."""
+    real = jnp.arange(body.vertices.shape[0]) < body.count
+    length, mass = jnp.sqrt(jnp.where(real, (body.vertices**2).sum(1), 0.0).max()), body.mass
+    rotary = mass * length**2
+    small_body = Body(body.vertices / length, body.count, body.mass / mass, body.inertia / rotary, body.friction)
+    small_hand = Hand(
+        joint=hand.joint / length,
+        length=hand.length / length,
+        offset=hand.offset / length,
+        inertia=hand.inertia / rotary,
+        viscous=hand.viscous / rotary,
+        dry=hand.dry / rotary,
+        torque_limit=hand.torque_limit,
+    )
+    pairs = every_meeting(body.vertices.shape[0])
+    touchable = pairs.feature < body.count
+    heavy = jnp.stack([small_body.mass, small_body.mass, small_body.inertia])
+    return System(
+        contacts=contacts(small_body, small_hand, formation),
+        candidates=contacts(small_body, small_hand, pairs),
+        real=touchable,
+        watched=touchable & ~_coincident(pairs, formation, body.count),
+        behind=_behind(pairs, formation, _convex(body)),
+        inertia=jnp.concatenate([heavy, small_hand.inertia]),
+        viscous=small_hand.viscous,
+        dry=small_hand.dry,
+        gravity=gravity / length,
+        length=length,
+        mass=mass,
+        torque_limit=hand.torque_limit,
+    )
+
+
+def _convex(body: Body) -> Bool[Array, ""]:
+    """Whether no corner of the object turns clockwise."""
+    following = next_vertex(body.count, body.vertices.shape[0])
+    edge = body.vertices[following] - body.vertices
+    turn = edge[:, 0] * edge[following, 1] - edge[:, 1] * edge[following, 0]
+    return jnp.all((turn >= 0) | (jnp.arange(turn.shape[0]) >= body.count))
+
+
+def _behind(pairs: Formation, formation: Formation, convex) -> Bool[Array, "candidates"]:
+    """Vertices against links that they may lie behind: any finger but one that vertices of a convex object slide on."""
+
+    def holds(link):
+        return jnp.any((formation.link == link) & (formation.kind == VERTEX))
+
+    return (pairs.kind == VERTEX) & (pairs.link > 0) & ~(convex & jax.vmap(holds)(pairs.link))
+
+
+def _coincident(pairs: Formation, formation: Formation, count) -> Bool[Array, "candidates"]:
+    """Pairs that are in the formation or coincide with one of its contacts."""
+
+    def same(link, kind, feature):
+        return (formation.link == link) & (formation.kind == kind) & (formation.feature == feature)
+
+    member = jax.vmap(same)(pairs.link, pairs.kind, pairs.feature).any(1)
+    # A tip on an edge whose two ends both lie on that finger has no gap of its own: the edge is flush with the link.
+    after = jnp.where(pairs.feature + 1 < count, pairs.feature + 1, 0)
+    here = jax.vmap(same)(pairs.link, jnp.zeros_like(pairs.kind), pairs.feature).any(1)
+    there = jax.vmap(same)(pairs.link, jnp.zeros_like(pairs.kind), after).any(1)
+    flush = (pairs.kind == EDGE) & here & there
+    return member | flush

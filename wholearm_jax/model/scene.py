@@ -1,0 +1,249 @@
+"""Scenes: a polygon, a hand, and a plan of contact formations. Immutable pytrees, SI units, radians.
+
+Frames follow design: `x` right, `y` up, the palm's surface is `y = 0`; finger 1 is the right one, finger 2 the left
+one; `theta` is measured anticlockwise from `+x`. The object's frame sits at its centre of mass with the axes of the
+given vertices.
+"""
+
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from wholearm_jax.core.arrays import array
+
+COORDINATES = ("x", "y", "phi", "theta1", "theta2")
+LINKS = ("palm", "finger1", "finger2")
+VERTEX, EDGE = 0, 1  # contact types: A, an object vertex on a link; B, a fingertip on an object edge
+_CONTACT = re.compile(r"(palm|finger1|finger2):([ve])([0-9]+)( rolling)?")
+
+
+class MassProperties(NamedTuple):
+    """Area, centroid and second moment of area about the centroid of a polygon."""
+
+    area: Float[Array, ""]
+    centroid: Float[Array, "2"]
+    second_moment: Float[Array, ""]
+
+
+class Polygon(eqx.Module):
+    """The object: a rigid polygon with anticlockwise vertices.
+
+    `vertices` is padded to a multiple of eight rows, so that polygons of different size share one compiled program;
+    `count` says how many rows are real. `friction` holds one coefficient for each link (palm, finger 1, finger 2).
+    `inertia` [kg m^2] and `center_of_mass` [m] are None for a uniform density.
+    """
+
+    vertices: Float[Array, "capacity 2"]
+    count: Int[Array, ""]
+    mass: Float[Array, ""]
+    friction: Float[Array, "3"]
+    inertia: Float[Array, ""] | None = None
+    center_of_mass: Float[Array, "2"] | None = None
+
+
+class Hand(eqx.Module):
+    """A palm on `y = 0` and two single-link fingers; row 0 of each array is finger 1, row 1 finger 2.
+
+    `joint` [m], `length` [m], `offset` of the contact edge from the joint axis toward the object [m], and the joint
+    parameters of eq. (1): `inertia` J [kg m^2], `viscous` B [N m s], `dry` D [N m], `torque_limit` [N m].
+    """
+
+    joint: Float[Array, "2 2"]
+    length: Float[Array, "2"]
+    offset: Float[Array, "2"]
+    inertia: Float[Array, "2"]
+    viscous: Float[Array, "2"]
+    dry: Float[Array, "2"]
+    torque_limit: Float[Array, "2"]
+
+
+class Formation(eqx.Module):
+    """A contact formation as data: one row a constraint, with the contact's link (0 palm, 1, 2), type (`VERTEX`,
+    `EDGE`) and feature number.
+
+    A sliding contact has one row, its gap. A rolling contact has two, one behind the other: its gap, then its slip,
+    marked `tangential`. Four rows make a wire: `2R + S = 4`.
+    """
+
+    link: Int[Array, "slots"]
+    kind: Int[Array, "slots"]
+    feature: Int[Array, "slots"]
+    tangential: Bool[Array, "slots"]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The contacts as files write them, e.g. `palm:v5` or `palm:v6 rolling`: one a contact, not one a row."""
+        link, kind, feature, tangential = (
+            np.asarray(a).tolist() for a in (self.link, self.kind, self.feature, self.tangential)
+        )
+        rolling = [*tangential[1:], False]
+        rows = zip(link, kind, feature, rolling, tangential, strict=True)
+        return tuple(contact_name(*row[:3], rolling=row[3]) for row in rows if not row[4])
+
+    @property
+    def normal_slots(self) -> tuple[int, ...]:
+        """The row of each contact's gap."""
+        return tuple(np.flatnonzero(~np.asarray(self.tangential)).tolist())
+
+    @property
+    def contact_of_slot(self) -> tuple[int, ...]:
+        """Which of `names` each row belongs to."""
+        return tuple((np.cumsum(~np.asarray(self.tangential)) - 1).tolist())
+
+
+class Heading(eqx.Module):
+    """Which way along the wire, and where to stop before its end.
+
+    Travel starts with the sign `sign` in coordinate number `coordinate` (-1: in the one that changes most); the phase
+    ends where coordinate number `until_coordinate` reaches `until_value`, or where the formation ends if that is -1.
+    """
+
+    coordinate: Int[Array, ""]
+    sign: Float[Array, ""]
+    until_coordinate: Int[Array, ""]
+    until_value: Float[Array, ""]
+
+
+class Phase(eqx.Module):
+    """One contact formation held for a while.
+
+    `arrive` is `"rest"` (the object must be at rest at the end), `"moving"` (the next phase takes over at speed, by an
+    inelastic impact), `"caught"` (any speed will do, and is lost before the next phase) or `"hold"` (the object must
+    stay where the phase begins, and its heading means nothing).
+    """
+
+    name: str = eqx.field(static=True)
+    formation: Formation
+    heading: Heading
+    duration: Float[Array, ""]
+    arrive: str = eqx.field(static=True, default="rest")
+
+
+class Scene(eqx.Module):
+    """A hand, an object, a rough start and a plan; every float in it can be differentiated with respect to.
+
+    `gravity` `(2,)` [m/s^2], `start` `(x, y, phi, theta1, theta2)` [m, rad]. Immutable; copies are made with equinox:
+
+    >>> import equinox as eqx
+    >>> scene = wa.load("heptagon")
+    >>> eqx.tree_at(lambda s: s.object.friction, scene, 1.2 * scene.object.friction).object.friction.tolist()
+    [0.12, 0.12, 0.12]
+    """
+
+    title: str = eqx.field(static=True)
+    gravity: Float[Array, "2"]
+    hand: Hand
+    object: Polygon
+    start: Float[Array, "5"]
+    phases: tuple[Phase, ...]
+
+
+class Body(eqx.Module):
+    """What the dynamics need of a polygon: vertices about the centre of mass, mass, inertia, friction."""
+
+    vertices: Float[Array, "capacity 2"]
+    count: Int[Array, ""]
+    mass: Float[Array, ""]
+    inertia: Float[Array, ""]
+    friction: Float[Array, "3"]
+
+
+def polygon(vertices, mass, friction, inertia=None, center_of_mass=None) -> Polygon:
+    """Build a `Polygon` from `(n, 2)` vertices; `friction` is a number or one for each link."""
+    given = np.asarray(vertices, float)
+    padding = np.broadcast_to(given[-1], (-len(given) % 8, 2))
+    return Polygon(
+        vertices=array(np.concatenate([given, padding])),
+        count=array(len(given), int),
+        mass=array(mass, float),
+        friction=array(np.broadcast_to(np.asarray(friction, float), (3,))),
+        inertia=None if inertia is None else array(inertia, float),
+        center_of_mass=None if center_of_mass is None else array(center_of_mass, float),
+    )
+
+
+def formation(contacts) -> Formation:
+    """Build a `Formation` from contact names such as `"palm:v5"`, `"finger2:e3"` or `"palm:v6 rolling"`."""
+    rows = []
+    for *feature, rolling in map(parse_contact, contacts):
+        rows += [(*feature, tangential) for tangential in (False, True)[: 1 + rolling]]
+    return Formation(*(array(column) for column in zip(*rows, strict=True)))
+
+
+def heading(toward: str | None, until: Mapping[Any, float] | None = None) -> Heading:
+    """Build a `Heading` from a coordinate and a sign (`"x-"`; None: either way) and an optional `{coordinate: value}`
+    to stop at."""
+    coordinate, value = next(iter(until.items())) if until else (None, 0.0)
+    return Heading(
+        coordinate=array(COORDINATES.index(toward[:-1]) if toward else -1, int),
+        sign=array(-1.0 if toward and toward[-1] == "-" else 1.0, float),
+        until_coordinate=array(-1 if coordinate is None else COORDINATES.index(coordinate), int),
+        until_value=array(value, float),
+    )
+
+
+def parse_contact(text: str) -> tuple[int, int, int, bool]:
+    """`"finger2:e3 rolling"` -> (link, kind, feature, rolling). Raises ValueError for anything else."""
+    match = _CONTACT.fullmatch(text.strip())
+    if match is None:
+        raise ValueError(f"'{text}' is not a contact; write LINK:vN or LINK:eN, e.g. palm:v5 or finger2:e3")
+    link, letter, number, rolling = match.groups()
+    if letter == "e" and link == "palm":
+        raise ValueError(f"'{text}': the palm has no tip; only fingers touch an edge")
+    return LINKS.index(link), VERTEX if letter == "v" else EDGE, int(number), rolling is not None
+
+
+def pair_name(contact: str) -> str:
+    """The two features of a contact, whether it slides or rolls: `palm:v6` of `palm:v6 rolling`."""
+    return contact.partition(" ")[0]
+
+
+def contact_name(link: int, kind: int, feature: int, *, rolling: bool = False) -> str:
+    """The inverse of `parse_contact`."""
+    return f"{LINKS[link]}:{'v' if kind == VERTEX else 'e'}{feature}" + (" rolling" if rolling else "")
+
+
+def next_vertex(count: Int[Array, ""], capacity: int) -> Int[Array, "capacity"]:
+    """The number of the vertex after each one, closing the polygon at `count`."""
+    following = jnp.arange(1, capacity + 1)
+    return jnp.where(following < count, following, 0)
+
+
+def mass_properties(vertices: Float[Array, "capacity 2"], count: Int[Array, ""]) -> MassProperties:
+    """Area, centroid and polar second moment about the centroid, by Green's theorem over the edges."""
+    here, there = vertices, vertices[next_vertex(count, vertices.shape[0])]
+    real = jnp.arange(vertices.shape[0]) < count
+    origin = jnp.where(real[:, None], vertices, 0.0).sum(0) / count  # sums about a nearby point keep their digits
+    here, there = here - origin, there - origin
+    cross = jnp.where(real, here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0], 0.0)
+    area = cross.sum() / 2
+    centroid = (cross[:, None] * (here + there)).sum(0) / (6 * area)
+    polar = (cross[:, None] * (here**2 + here * there + there**2)).sum() / 12
+    return MassProperties(area, centroid + origin, polar - area * centroid @ centroid)
+
+
+@jax.jit
+def body(shape: Polygon) -> Body:
+    """The polygon about its centre of mass, with the inertia of a uniform density unless the scene gives its own."""
+    uniform = mass_properties(shape.vertices, shape.count)
+    center = uniform.centroid if shape.center_of_mass is None else shape.center_of_mass
+    away = uniform.centroid - center
+    own = shape.mass * (uniform.second_moment / uniform.area + away @ away)
+    return Body(
+        vertices=shape.vertices - center,
+        count=shape.count,
+        mass=shape.mass,
+        inertia=own if shape.inertia is None else shape.inertia,
+        friction=shape.friction,
+    )
+
+
+def replace_duration(phase: Phase, duration) -> Phase:
+    """A phase with another duration."""
+    return eqx.tree_at(lambda p: p.duration, phase, array(duration, float))

@@ -1,0 +1,191 @@
+"""Group: phases that follow one another at speed are one problem, which is descended on from several starts.
+
+A group begins and ends at rest, or with the plan. Where torque rates are limited its first and last torques are those
+that it shares with its neighbours (`handover`). What counts is not what the descent says of its intervals but an
+honest simulation of the schedules.
+
+Derivation: section 9 of `docs/derivation.md`.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import numpy as np
+import optax
+
+from wholearm_jax.core.arrays import array
+from wholearm_jax.core.status import Status
+from wholearm_jax.margin.quasistatic import Bound
+from wholearm_jax.model.scene import Phase, Scene
+from wholearm_jax.model.schedule import Torque, evenly, in_turn, padded
+from wholearm_jax.optimisation.initial_guess import guesses
+from wholearm_jax.optimisation.interior_point import interior_point, projected
+from wholearm_jax.optimisation.linearisation import Limits
+from wholearm_jax.optimisation.multiple_shooting import Variables, further
+from wholearm_jax.optimisation.rest_transition import Handover
+from wholearm_jax.optimisation.solver import CONVERGED, REPEATED, Problem, Step, descend
+from wholearm_jax.phases.phase import Traced, run
+from wholearm_jax.phases.plan import stacked
+from wholearm_jax.phases.result import stays
+from wholearm_jax.simulation.integrator import Integration, with_room
+
+TORQUE_SHARE = 0.9  # share of the torque limits that a start may use
+SHORTEST = 0.01  # share of its longest time that a phase moves at the least
+GOOD = 0.99  # share of the bound with which no further start is tried
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What `optimise` was asked for; `rows` is the size of the whole plan's schedule: those of one share programs."""
+
+    knots: int
+    rows: int
+    steps: int
+    rate_limit: float | None
+    durations: tuple[float, float] | None
+    passing: float
+    optimiser: optax.GradientTransformation | None
+    tolerance: float
+    callback: Callable[[Step], None] | None
+
+
+@dataclass(frozen=True)
+class Group:
+    """Phases with all that is known of them; `index` is the first one's number."""
+
+    index: int
+    phases: tuple[Phase, ...]
+    traced: list[Traced]
+    tops: list[Bound]
+    begin: Handover | None  # where torque rates are limited, and a phase stands before
+    end: Handover | None  # or behind
+    wanted: Wanted
+
+    @property
+    def pins(self) -> dict[tuple[int, int], np.ndarray]:
+        """Torques that stay as they are, in units of their limits, by phase and knot."""
+        begin = [] if self.begin is None else [((0, 0), self.begin, self.begin.begin / self.limits[0])]
+        end = [] if self.end is None else [((-1, -1), self.end, self.end.torque / self.limits[-1])]
+        return {at: torque for at, change, torque in [*begin, *end] if change.serves}
+
+    @property
+    def most(self) -> float:
+        """The share of the bounds that the torques at both ends allow."""
+        changes = [change.share for change in (self.begin, self.end) if change is not None and change.serves]
+        return min([1.0, *changes])
+
+    @property
+    def lead(self) -> np.ndarray:
+        """How long the object waits in each phase before it sets out."""
+        first = self.begin.lead if self.begin is not None else 0.0
+        return np.append(first, np.zeros(len(self.phases) - 1))
+
+    @property
+    def durations(self) -> np.ndarray:
+        """How long it moves in each."""
+        return np.array([float(p.duration) for p in self.phases]) - self.lead
+
+    @property
+    def limits(self) -> np.ndarray:
+        """The largest torques of each [N m]."""
+        return np.stack([np.asarray(at.table.torque_limit) for at in self.traced])
+
+    @property
+    def bounds(self) -> np.ndarray:
+        return np.array([float(top.value) for top in self.tops])
+
+    def problem(self, limits: Limits) -> Problem:
+        """What is descended on."""
+        tables = stacked_tables([at.table for at in self.traced])
+        return Problem(self.index, tables, self.bounds, limits, self.wanted.steps, self.wanted.tolerance)
+
+
+def optimise_group(scene: Scene, group: Group) -> tuple[list[Torque], str, list[Step]]:
+    """Descend from one start after the other, until one comes near the bound or two agree.
+
+    Returns the best schedules (each from time 0), why their descent stopped, and the steps taken.
+    """
+    wanted, tolerance = group.wanted, group.wanted.tolerance
+    for at in group.traced:
+        if int(at.table.status) != Status.OK:
+            why = f"the wire cannot be followed: {Status(int(at.table.status)).label}"
+            return [evenly(t, np.zeros((wanted.knots, 2))) for t in group.durations], why, []
+    begins = guesses([at.table for at in group.traced], group.durations, wanted.knots, TORQUE_SHARE)
+    weakest = int(np.argmin(group.bounds))
+    if group.bounds[weakest] <= 0:
+        where = 100 * float(group.tops[weakest].share)
+        why = f"no torque within limits holds this formation at {where:.0f} % of its wire"
+        return _schedules(group, begins[0]), why, []
+    if group.begin is not None and not group.begin.serves:
+        return _schedules(group, begins[0]), "no torque lets this formation take over at the limited rate", []
+    problem = group.problem(_limits(group))
+    method = descent_method(wanted.optimiser, len(group.phases), further(problem.tables))
+    found, history = [], []
+    for number, start in enumerate(begins):
+        for at, torque in group.pins.items():
+            start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[at].set(torque))
+        ended = [other for fine, _, why, other in found if fine and why == CONVERGED]
+        p, why, taken = descend(problem, start, number, method, wanted.callback, ended)
+        history += taken
+        if why == REPEATED:
+            break
+        fine, share = _honest(scene, group, p)
+        best = max((other for ok, other, *_ in found if ok), default=np.nan)
+        agree = fine and abs(share - best) <= tolerance
+        found.append((fine, share, why, p))
+        if agree or (fine and share >= GOOD * group.most):
+            break
+    fine, share, why, p = max(found, key=lambda one: one[:2])
+    if fine and share >= 1 - tolerance:
+        why = f"within {tolerance:g} of the bound"
+    return _schedules(group, p), why, history
+
+
+def _schedules(group: Group, p: Variables) -> list[Torque]:
+    """Each phase's schedule, from time 0."""
+    values, lengths = np.asarray(p.torque) * group.limits[:, None], np.exp(np.asarray(p.log_duration))
+    first, *others = [evenly(length, rows) for length, rows in zip(lengths, values, strict=True)]
+    if group.begin is not None and group.begin.lead > 0:
+        times = np.append(0.0, group.begin.lead + np.asarray(first.times))
+        first = Torque(array(times), array(np.vstack([group.begin.torque, first.values])))
+    return [first, *others]
+
+
+def _honest(scene: Scene, group: Group, p: Variables) -> tuple[bool, float]:
+    """Whether a simulation of the schedules says `ok`, holds included, and the least margin over its bound."""
+    start, shares, fine, arriving = 0.0, [], [], None
+    torque = in_turn(_schedules(group, p))
+    schedule, how = padded(torque, group.wanted.rows), with_room(Integration(), group.wanted.knots)
+    ends = np.cumsum(np.exp(np.asarray(p.log_duration)) + group.lead)
+    for phase, at, end, top in zip(group.phases, group.traced, ends, group.bounds, strict=True):
+        one = run(at.table, schedule, start, end - start, how, phase.arrive, arriving)
+        start += float(one.duration) * float(np.asarray(one.motion.share)[int(one.motion.count)])
+        arriving = one.leaving if phase.arrive == "moving" else None
+        held = stays(scene, torque, phase, at, one)
+        fine.append(int(one.verdict.status) == Status.OK and all(h.lost is None for h in held))
+        shares.append(float(one.score.margin) / top)
+    least = min(shares)
+    return all(fine), least if np.isfinite(least) else -np.inf
+
+
+def _limits(group: Group) -> Limits:
+    lengths, asked = group.durations, group.wanted
+    shortest, longest = (lengths, lengths) if asked.durations is None else (t - group.lead for t in asked.durations)
+    rate = np.full(2, np.inf if asked.rate_limit is None else float(asked.rate_limit))
+    pinned = np.zeros((len(lengths), asked.knots), bool)
+    for at in group.pins:
+        pinned[at] = True
+    shortest, unit = np.maximum(shortest, SHORTEST * longest), np.maximum(group.bounds, 1e-300)
+    return Limits(*(array(a) for a in (rate, shortest, longest, np.asarray(asked.passing), pinned, unit)))
+
+
+@functools.cache
+def descent_method(optimiser, phases: int, further: int):
+    """One transformation for every use, so that programs are not compiled again."""
+    return interior_point(phases, further) if optimiser is None else projected(optimiser)
+
+
+stacked_tables = jax.jit(stacked)

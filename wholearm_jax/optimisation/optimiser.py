@@ -1,0 +1,293 @@
+"""Optimise: the torque schedule of a plan with the largest compressive margin.
+
+Phases that begin and end at rest have each their own problem; those that follow one another at speed have one together;
+those that hold the object have the best torque of its statics (`holding`). Problems are solved side by side.
+It starts from the quasi-static torques of a smooth motion, descends (`pacing`) while the temperature of the smooth
+margin falls, and keeps the best schedule whose honest simulation succeeds.
+"""
+
+import itertools
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from wholearm_jax.core.arrays import array
+from wholearm_jax.core.programs import Beside, Program, beside, wait
+from wholearm_jax.core.status import Status
+from wholearm_jax.core.validation import require_positive, require_x64
+from wholearm_jax.dynamics.path_dynamics import blank
+from wholearm_jax.margin.quasistatic import Bound, bound
+from wholearm_jax.model.scene import Phase, Scene, replace_duration
+from wholearm_jax.model.schedule import Torque, evenly, in_turn, rounded
+from wholearm_jax.optimisation.coupled_phases import (
+    SHORTEST,
+    TORQUE_SHARE,
+    Group,
+    Wanted,
+    descent_method,
+    optimise_group,
+    stacked_tables,
+)
+from wholearm_jax.optimisation.initial_guess import guesses
+from wholearm_jax.optimisation.interior_point import advance, begin
+from wholearm_jax.optimisation.linearisation import Limits
+from wholearm_jax.optimisation.multiple_shooting import Variables, further
+from wholearm_jax.optimisation.rest_transition import Handover, handovers, steady
+from wholearm_jax.optimisation.solver import HOW, Step
+from wholearm_jax.phases.phase import Traced, balance_at_start, run_blank
+from wholearm_jax.phases.plan import outcomes, trace
+from wholearm_jax.phases.result import Result, describe
+from wholearm_jax.simulation.integrator import Integration, with_room
+from wholearm_jax.tracing.path import Resolution
+
+LEADS = (0.25, 0.1)  # shares of a phase for which its object may wait before it sets out, where rates are limited
+PASSING = 0.2  # least speed with which a phase is entered that does not begin at rest, over its mean speed
+
+
+@dataclass(frozen=True)
+class Optimised:
+    """An optimised plan: the simulated `result`, for each phase its `bound` [N] and why the descent stopped.
+
+    `scene` carries the durations that were found. `history` holds every step.
+    """
+
+    scene: Scene
+    torque: Torque
+    result: Result
+    bounds: tuple[Bound, ...]
+    stopped: tuple[str, ...]
+    history: tuple[Step, ...]
+
+    @property
+    def reached(self) -> tuple[float, ...]:
+        """The share of its bound that each phase reached; NaN where the bound is not positive."""
+        pairs = zip(self.result.phases, self.bounds, strict=True)
+        return tuple(p.margin / float(b.value) if float(b.value) > 0 else float("nan") for p, b in pairs)
+
+
+def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = ()) -> Torque:
+    """The quasi-static torques: at each knot the best squeeze for an even rest-to-rest motion, in closed form.
+
+    The motion's speed is `v ~ u^p (1 - u)^q` in `u = t / duration`: the even `p = q = 1` unless another of `PROFILES`
+    allows a larger margin. As the inverse dynamics at the knots only, the schedule carries the object near the wire's
+    end, not exactly to it. A phase that holds the object gets its best torque.
+
+    Derivation, section 8. Returns `knots` rows a phase. Raises ValueError for fewer than two.
+
+    >>> wa.quasistatic(wa.load("heptagon"), knots=11).values.shape
+    (22, 2)
+    """
+    require_knots(knots)
+    traced = traced or trace(scene)
+
+    def torques(at, phase):
+        if phase.arrive == "hold":
+            return steady(scene, phase, at, knots)
+        start = guesses([at.table], [float(phase.duration)], knots, 1.0)[0]
+        return evenly(float(phase.duration), at.table.torque_limit * start.torque[0])
+
+    return in_turn([torques(*pair) for pair in zip(traced, scene.phases, strict=True)])
+
+
+def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...]:
+    """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.bound`), or
+    that of the statics for a phase that holds the object; `-inf` for a wire that could not be traced.
+
+    Derivation, section 8: a tuple of `Bound`, one a phase, with `value` [N], and `s` and `share` of the wire where
+    it is tight.
+
+    >>> [f"{float(bound.value):.3f} N" for bound in wa.bounds(wa.load("heptagon"))]
+    ['0.966 N', '0.838 N']
+    """
+    traced = traced or trace(scene)
+    begins = [True, *(p.arrive != "moving" for p in scene.phases[:-1])]
+    rows = zip(traced, scene.phases, begins, strict=True)
+
+    def top(at, phase, begin):
+        if int(at.table.status) != Status.OK:
+            return Bound(jnp.asarray(-np.inf), at.table.breaks[0], jnp.zeros(()))
+        if phase.arrive != "hold":
+            told = array(begin), array(phase.arrive == "rest"), _rolling(phase)
+            return _bound(at.table, phase.duration, *told)
+        balance, departure = balance_at_start(scene, phase, at)
+        return Bound(jnp.asarray(balance.best(departure).margin), at.table.breaks[0], jnp.zeros(()))
+
+    return tuple(top(*row) for row in rows)
+
+
+def optimise(
+    scene: Scene,
+    *,
+    knots: int = 51,
+    steps: int = 160,
+    rate_limit: float | None = None,
+    durations: tuple[float, float] | None = None,
+    passing: float = PASSING,
+    optimiser: optax.GradientTransformation | None = None,
+    tolerance: float = 1e-3,
+    callback: Callable[[Step], None] | None = None,
+    traced: tuple[Traced, ...] = (),
+) -> Optimised:
+    """Find the torque schedule with the largest compressive margin by gradient descent through the simulation.
+
+    Each phase must arrive at its planned end in time, `moving` where the next takes over and else at rest, also where
+    the plan would allow any speed (`caught`, and a last phase that is `moving`); `knots` torques a joint and phase,
+    evenly spaced over the time for which it moves, are linear in between. The scene's torque limits hold, and
+    `rate_limit` [N m/s] if given: then torques do not step where phases change either, and an object may wait, held by
+    friction, for up to a quarter of a phase until the torque sets it out (`handover`). `durations = (shortest,
+    longest)` lets each phase choose its own. Formations that take over at speed are entered with at least `passing`
+    times their phase's mean speed (wire over duration): an object that hardly moves where its formation changes may as
+    well stop short of it. `optimiser` replaces the interior point by any optax optimiser (`descent.projected`). A phase
+    stops when its margin comes within `tolerance` of the bound or no longer improves by that share, or after `steps`.
+    `callback` sees every step, one at a time, but of several phases in no particular order: those that do not follow at
+    speed are descended on side by side, each in a thread of its own. `traced` reuses the result of `trace`. A phase
+    that holds the object keeps its duration and gets the best torque of its statics, approached and left as fast as
+    `rate_limit` allows. Where no torque can hold a formation, nothing is searched and the status says so.
+
+    Derivation, section 9. Raises RuntimeError without float64, ValueError for fewer than two `knots`, and for numbers
+    that are not positive.
+
+    >>> found = wa.optimise(wa.load("heptagon"))
+    >>> found.result.status.label, [f"{share:.2f}" for share in found.reached]
+    ('ok', ['1.00', '1.00'])
+    """
+    require_x64()
+    require_knots(knots)
+    require_positive(steps=steps, tolerance=tolerance, rate_limit=np.inf if rate_limit is None else rate_limit)
+    if durations is not None and not 0 < durations[0] <= durations[1]:
+        raise ValueError("durations are (shortest, longest), positive and in this order")
+    if durations is not None and durations[0] == durations[1]:
+        scene, durations = _lasting(scene, durations[0]), None
+    compiled = optimise_beside(scene, knots=knots, optimiser=optimiser)
+    traced = traced or trace(scene)
+    if any(int(at.table.status) == Status.OK for at in traced):
+        wait(*compiled)
+    # A bound covers speeds as multiples of a length a duration: of the shortest that a phase may choose.
+    least = scene if durations is None else _lasting(scene, max(durations[0], SHORTEST * durations[1]))
+    tops = bounds(least, traced=traced)
+    rows = _rows(scene, knots)
+    told = callback and _in_turn_called(callback)
+    wanted = Wanted(knots, rows, steps, rate_limit, durations, passing, optimiser, tolerance, told)
+    found = []
+    for lead in LEADS if rate_limit is not None else LEADS[:1]:
+        found.append(_attempt(scene, traced, tops, wanted, lead))
+        if found[-1].result.status is Status.OK:
+            return found[-1]
+    return max(found, key=lambda one: one.result.margin)
+
+
+def require_knots(knots: int) -> None:
+    """Raise ValueError for too few to be a schedule."""
+    if knots < 2:
+        raise ValueError(f"knots must be at least 2, not {knots}")
+
+
+def _attempt(scene: Scene, traced, tops, wanted: Wanted, lead: float) -> Optimised:
+    """All groups of phases side by side, objects waiting at most a share `lead` of a phase before they set out."""
+    groups = _groups(scene)
+    changes: list[Handover | None] = [None] * (len(groups) - 1)
+    if wanted.rate_limit is not None:
+        changes = handovers(scene, groups, traced, tops, wanted.rate_limit, lead, wanted.durations)
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        one = partial(_part, scene, traced, tops, wanted)
+        parts = list(threads.map(one, groups, itertools.pairwise([None, *changes, None])))
+    found = [schedule for schedules, _, _ in parts for schedule in schedules]
+    stopped = [why for schedules, why, _ in parts for _ in schedules]
+    history = [step for *_, taken in parts for step in taken]
+    lengths = [float(np.asarray(f.times)[-1]) for f in found]
+    phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, lengths, strict=True))
+    scene = eqx.tree_at(lambda s: s.phases, scene, phases)
+    torque = in_turn(found)
+    result = describe(scene, torque, traced, outcomes(scene, torque, traced, with_room(Integration(), wanted.knots)))
+    return Optimised(scene, torque, result, tops, tuple(stopped), tuple(history))
+
+
+def _part(
+    scene: Scene, traced, tops, wanted: Wanted, group: list[int], ends: tuple[Handover | None, Handover | None]
+) -> tuple[list[Torque], str, list[Step]]:
+    """One group of phases, given how it takes over and hands over: schedules, why their descent stopped, its steps."""
+    phases, (begin, end) = tuple(scene.phases[k] for k in group), ends
+    if phases[0].arrive == "hold":
+        held = steady(scene, phases[0], traced[group[0]], wanted.knots, wanted.rate_limit, begin, end)
+        return [held], "the best torque of a linear programme", []
+    wires, most = [traced[k] for k in group], [tops[k] for k in group]
+    return optimise_group(scene, Group(group[0], phases, wires, most, begin, end, wanted))
+
+
+def _in_turn_called(callback: Callable[[Step], None]) -> Callable[[Step], None]:
+    """The same, called by one thread at a time."""
+    turn = threading.Lock()
+
+    def call(step: Step) -> None:
+        with turn:
+            callback(step)
+
+    return call
+
+
+def _lasting(scene: Scene, duration: float) -> Scene:
+    """The same plan, but for the duration of all phases that move the object."""
+    phases = (p if p.arrive == "hold" else replace_duration(p, duration) for p in scene.phases)
+    return eqx.tree_at(lambda s: s.phases, scene, tuple(phases))
+
+
+def optimise_beside(
+    scene: Scene, *, knots: int = 51, optimiser: optax.GradientTransformation | None = None
+) -> tuple[Beside, ...]:
+    """Compile what `optimise` runs in a thread of its own, while wires are traced; it is to be waited for."""
+    sizes = sorted({len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"})
+    rolling = sorted({_rolling(p) for p in scene.phases if p.arrive != "hold"})
+    squeezes = beside(_squeeze_blank, tuple(sizes), tuple(rolling), knots)
+    descents = [beside(_advance_blank, n, knots, optimiser) for n in sizes]
+    return squeezes, *descents, beside(run_blank, _rows(scene, knots), with_room(Integration(), knots))
+
+
+def _rows(scene: Scene, knots: int) -> int:
+    """Room for the whole plan's schedule, and for what stands before its phases where rates are limited."""
+    return rounded((knots + 1) * len(scene.phases))
+
+
+def _groups(scene: Scene) -> list[list[int]]:
+    """Phases that follow one another at speed have one problem together."""
+    groups, fresh = [], True
+    for index, phase in enumerate(scene.phases):
+        groups = [*groups, [index]] if fresh else [*groups[:-1], [*groups[-1], index]]
+        fresh = phase.arrive != "moving"
+    return groups
+
+
+def _rolling(phase: Phase) -> int:
+    """How many contacts of a phase roll."""
+    return int(np.asarray(phase.formation.tangential).sum())
+
+
+def _squeeze_blank(sizes: tuple[int, ...], rolling: tuple[int, ...], knots: int) -> None:
+    """Make the bounds and starts of groups of such sizes on tables that have no wire."""
+    table, one = blank(Resolution()), array(1.0)
+    for count in rolling:
+        _bound(table, one, array(True), array(True), count)
+    for phases in sizes:
+        guesses([table] * phases, np.ones(phases), knots, TORQUE_SHARE)
+
+
+def _advance_blank(phases: int, knots: int, optimiser: optax.GradientTransformation | None) -> None:
+    """Take one step of a descent on tables that have no wire."""
+    tables = stacked_tables([blank(Resolution())] * phases)
+    method = descent_method(optimiser, phases, further(tables))
+    each = np.ones(phases)
+    plain = (np.full(2, np.inf), each, each, np.zeros(()), np.zeros((phases, knots), bool), each)
+    limits = Limits(*(array(a) for a in plain))
+    empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
+    p = Variables(*(array(a) for a in empty))
+    advance(begin(p, method), tables, limits, HOW, method)
+
+
+_bound = Program(bound)

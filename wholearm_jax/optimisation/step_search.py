@@ -1,0 +1,135 @@
+"""The paper's own way to torques (section 3.1): steps of ten per cent. Kept as an honest baseline, nothing more.
+
+For each phase both joints first get the constant torques that would hold the object still with the best squeeze, within
+a share of their limits (a few shares are tried, since the paper only says that it knew how much to begin with). Then
+the torque of the pushing finger is raised by 10 % until the object begins to move, raised on while every contact stays
+compressive, and lowered by 10 % when a contact opens; the last torque that works is recorded. Each phase therefore
+begins with a step in the torque, and ends as soon as its wire does, at whatever speed: a phase of the search arrives
+`caught`, and the next is taken to start from rest.
+
+Derivation: section 10 of `docs/derivation.md`.
+"""
+
+import time
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from wholearm_jax.core.programs import Beside, beside, wait
+from wholearm_jax.core.status import Status
+from wholearm_jax.core.validation import require_x64
+from wholearm_jax.margin.quasistatic import coefficients, hold
+from wholearm_jax.model.scene import Phase, Scene, replace_duration
+from wholearm_jax.model.schedule import Torque, padded, rounded
+from wholearm_jax.phases.phase import Traced, run, run_blank
+from wholearm_jax.phases.plan import require_motion, simulate, trace
+from wholearm_jax.phases.result import Result
+from wholearm_jax.simulation.integrator import Integration
+
+STEP = 1.1
+HOLDS = tuple(STEP**-k for k in range(26, 0, -1))  # shares of the torque limits within which a series may begin
+MOST = 60  # raises a series before the search gives up
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What the search found: the scene with the durations that came out, the schedule, its simulation and the cost."""
+
+    scene: Scene
+    torque: Torque
+    result: Result
+    simulations: int
+    seconds: float
+
+
+def search(scene: Scene, *, longest: float = 10.0, traced: tuple[Traced, ...] = ()) -> Searched:
+    """Search each phase's torques by steps of 10 %; no phase may take longer than `longest` seconds.
+
+    A phase for which no raise works keeps the attempt with the largest margin, and the result's status says what it
+    does. `traced` reuses the result of `trace`. Raises ValueError for a plan with a phase that holds the object.
+
+    The paper's section 3.1 (derivation, section 10). Raises RuntimeError without float64.
+
+    >>> found = wa.search(wa.load("hexagon"))
+    >>> found.result.status.label, found.torque.values.shape
+    ('ok', (4, 2))
+    """
+    require_x64()
+    require_motion(scene)
+    begun = time.perf_counter()
+    if not traced:
+        compiled = search_beside()
+        traced = trace(scene)
+        wait(compiled)
+    phases, times, rows, start, count = [], [], [], 0.0, 0
+    for phase, at in zip(scene.phases, traced, strict=True):
+        torque, duration, tried = _search_phase(at, longest)
+        count += tried
+        phases.append(_arriving(replace_duration(phase, duration)))
+        times += [start, start + duration]
+        rows += [torque, torque]
+        start += duration
+    found = eqx.tree_at(lambda s: s.phases, scene, tuple(phases))
+    schedule = Torque(jnp.asarray(times), jnp.asarray(np.array(rows)))
+    result = simulate(found, schedule, traced=traced)
+    return Searched(found, schedule, result, count + len(phases), time.perf_counter() - begun)
+
+
+def search_beside() -> Beside:
+    """Compile what `search` runs in a thread of its own, while wires are traced; it is to be waited for."""
+    return beside(run_blank, rounded(2), Integration())
+
+
+def _arriving(phase: Phase) -> Phase:
+    return Phase(phase.name, phase.formation, phase.heading, phase.duration, arrive="caught")
+
+
+def _search_phase(at: Traced, longest: float) -> tuple[np.ndarray, float, int]:
+    """Torques, the time the wire takes under them, and the number of simulations."""
+    if int(at.table.status) != Status.OK:
+        return np.zeros(2), 1.0, 0
+    series = [_raise(at.table, share, longest) for share in HOLDS]
+    count = sum(tried for *_, tried in series)
+    torque, duration, _, _ = max(series, key=lambda one: (one[2] is Status.OK, one[3]))[:4]
+    return torque, duration, count
+
+
+def _raise(table, share: float, longest: float) -> tuple[np.ndarray, float, Status, float, int]:
+    """One series of raises from the best hold within a share of the torque limits: the last that worked, or of those
+    that failed the one with the largest margin."""
+    limit = np.asarray(table.torque_limit)
+    tight = eqx.tree_at(lambda t: t.torque_limit, table, share * table.torque_limit)
+    begin = _hold(tight, table.breaks[0])
+    torque = np.clip(np.asarray(begin.torque), -share * limit, share * limit)
+    if not np.isfinite(float(begin.margin)):  # no torque within this share balances
+        return torque, longest, Status.STUCK, -np.inf, 0
+    pull = np.asarray(_coefficients(table, table.breaks[0])[0])[3:]
+    # The pushing finger is the one whose torque, raised in its own direction, accelerates the object more.
+    pushing = int(np.argmax(pull * np.sign(torque)))
+    kept: tuple[np.ndarray, float, Status, float] = (torque, longest, Status.STUCK, -np.inf)
+    count, going = 0, True
+    while going and count < MOST:
+        count += 1
+        status, margin, end = _attempt(table, torque, longest)
+        margin = margin if np.isfinite(margin) else -np.inf  # what never moves has no least force
+        if status is Status.OK or (kept[2] is not Status.OK and margin > kept[3]):
+            kept = (torque, end, status, margin)
+        opened = status is Status.CONTACT_LOST and kept[2] is Status.OK
+        torque = np.where(np.arange(2) == pushing, STEP * torque, torque)
+        # Where a contact opens, back by 10 %: that is the last one that worked.
+        going = not opened and abs(torque[pushing]) <= limit[pushing]
+    torque, end, status, margin = kept
+    return torque, end, status, margin, count
+
+
+_hold, _coefficients = eqx.filter_jit(hold), eqx.filter_jit(coefficients)
+
+
+def _attempt(table, torque, longest) -> tuple[Status, float, float]:
+    """One simulation under constant torques: status, margin and the time at which it ended."""
+    schedule = padded(Torque(jnp.asarray([0.0, longest]), jnp.asarray(np.stack([torque, torque]))))
+    outcome = run(table, schedule, jnp.zeros(()), jnp.asarray(longest), Integration(), "caught")
+    end = float(outcome.motion.share[int(outcome.motion.count)]) * longest
+    return Status(int(outcome.verdict.status)), float(outcome.score.margin), max(end, 1e-6)

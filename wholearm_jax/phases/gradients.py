@@ -1,0 +1,53 @@
+"""Gradient: the margin and its derivatives with respect to the torques, in the mode that costs less.
+
+Forward mode carries one direction for each torque, reverse mode goes back through the steps once, however many there
+are. Measured (`benchmarks/gradients.py`), the first is cheaper for schedules of up to `FORWARD` rows.
+"""
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float
+
+from wholearm_jax.core.validation import require_x64
+from wholearm_jax.model.scene import Scene
+from wholearm_jax.model.schedule import Torque
+from wholearm_jax.phases.phase import Traced
+from wholearm_jax.phases.plan import least, outcomes, roomy, steps_within, trace
+from wholearm_jax.simulation.integrator import Integration, tolerance_as_data
+
+FORWARD = 2
+
+
+def torque_gradient(
+    scene: Scene, torque: Torque, *, traced: tuple[Traced, ...] = (), tolerance: float = 1e-10
+) -> tuple[Float[Array, ""], Float[Array, "rows 2"]]:
+    """The margin `m` [N] of a plan as by `plan.margin`, and `dm/dtau` [1/m] at every row of its schedule.
+
+    `traced` reuses the result of `trace`, `tolerance` is the integrator's. Compiled once for every number of rows.
+
+    >>> from wholearm_jax.phases.gradients import torque_gradient
+    >>> scene = wa.load("heptagon")
+    >>> m, slope = torque_gradient(scene, wa.quasistatic(scene, knots=6))
+    >>> slope.shape
+    (12, 2)
+    """
+    require_x64()
+    how = Integration(tolerance=tolerance, adjoint=mode(torque), steps=steps_within(scene, torque))
+    how = tolerance_as_data(roomy(how, scene, torque), torque.times.dtype)
+    return _gradient(scene, torque, traced or trace(scene), how)
+
+
+def mode(torque: Torque) -> str:
+    """`"forward"` or `"reverse"`: the mode that costs less for a schedule."""
+    return "forward" if torque.times.shape[0] <= FORWARD else "reverse"
+
+
+@eqx.filter_jit
+def _gradient(scene, torque, traced, how):
+    def value(values):
+        m = least(scene, outcomes(scene, Torque(torque.times, values), traced, how))
+        return m, m
+
+    derivative = jax.jacfwd if how.adjoint == "forward" else jax.grad
+    slope, m = derivative(value, has_aux=True)(torque.values)
+    return m, slope

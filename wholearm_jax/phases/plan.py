@@ -1,0 +1,314 @@
+"""Plans: trace and simulate a scene's phases one after the other, and say what became of them.
+
+Each phase starts where the wire of the phase before it ended: at rest, or, where that phase arrives `moving`, with the
+speed that the impact leaves (`reduction.change`), at the moment when the formation changes. It has time until its
+planned end.
+"""
+
+from dataclasses import replace
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from wholearm_jax.core.arrays import array
+from wholearm_jax.core.programs import Beside, beside, transformed, wait
+from wholearm_jax.core.status import Status
+from wholearm_jax.core.validation import require_positive, require_x64
+from wholearm_jax.model.mechanics import system
+from wholearm_jax.model.scene import Phase, Scene, body
+from wholearm_jax.model.schedule import Torque, has_steps, padded, rounded
+from wholearm_jax.phases.assessment import ARRIVAL, GOALS
+from wholearm_jax.phases.phase import (
+    Outcome,
+    Traced,
+    destination,
+    follow,
+    prepare,
+    run,
+    run_blank,
+)
+from wholearm_jax.phases.result import Result, describe
+from wholearm_jax.simulation.integrator import Integration, tolerance_as_data, with_room
+from wholearm_jax.tracing.path import Resolution, Wire
+
+ROUNDING = 1e4  # of a precision's last digit, the interpolation error that more panels do not make smaller
+
+
+def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: float = 1e-9) -> tuple[Traced, ...]:
+    """Trace and tabulate every phase of a plan.
+
+    The table of a phase is refined (panels doubled, up to 512) until its interpolation error, relative to each
+    function's size, is below `tolerance`; pieces are added likewise. What cannot be traced says so in
+    `Traced.table.status`, and what follows it cannot be trusted.
+
+    The paper's "set of C-functions equated to zero", solved along the whole wire (derivation, section 3).
+
+    >>> traced = wa.trace(wa.load("heptagon"))
+    >>> [wa.Status(int(one.table.status)).label for one in traced]
+    ['ok', 'ok']
+    >>> print(f"{float(traced[0].table.length):.2f} object radii")
+    1.33 object radii
+    """
+    if transformed(scene):  # shapes are fixed there: the caller has chosen the resolution
+        return _apart(traced_together(scene, resolution), len(scene.phases))
+    solid, rough, found = body(scene.object), scene.start, []
+    for phase in scene.phases:
+        begin = rough, array(not found)
+        traced = _refined(solid, scene, phase, *begin, resolution, tolerance)
+        if phase.arrive == "hold" and int(traced.table.status) != Status.OK:
+            other = eqx.tree_at(lambda p: p.heading.sign, phase, -phase.heading.sign)
+            traced = _refined(solid, scene, other, *begin, resolution, tolerance)
+        found.append(traced)
+        rough = destination(phase, traced)
+    return tuple(found)
+
+
+@eqx.filter_jit
+def traced_together(scene: Scene, resolution: Resolution) -> Traced:
+    """Every phase of a plan in one program: `Traced` with an axis of phases."""
+    solid = body(scene.object)
+
+    def one(at, phase):
+        """Trace a phase from where the one before it ended."""
+        (rough, first), (formation, heading, holds) = at, phase
+        traced = prepare(solid, scene.hand, scene.gravity, formation, rough, heading, resolution, first, holds)
+        return (jnp.where(holds, traced.begin, traced.end), jnp.asarray(False)), traced
+
+    return jax.lax.scan(one, (scene.start, jnp.asarray(True)), _traced_told(scene))[1]
+
+
+def wires_together(scene: Scene, resolution: Resolution) -> Wire:
+    """The wires alone: `Wire` with an axis of phases."""
+    solid = body(scene.object)
+
+    def one(at, phase):
+        (rough, first), (formation, heading, holds) = at, phase
+        mechanics = system(solid, scene.hand, scene.gravity, formation)
+        wire, begin, end = follow(mechanics, rough, heading, resolution, first, holds)
+        return (jnp.where(holds, begin, end), jnp.asarray(False)), wire
+
+    return jax.lax.scan(one, (scene.start, jnp.asarray(True)), _traced_told(scene))[1]
+
+
+def _traced_told(scene: Scene):
+    """What a plan says of its phases' wires, with an axis of phases: formation, heading, and whether it only holds."""
+    return stacked([(p.formation, p.heading, jnp.asarray(p.arrive == "hold")) for p in scene.phases])
+
+
+def stacked(several):
+    """Trees of one kind as one with a leading axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
+
+
+def _apart(together, count: int) -> tuple:
+    """The `count` trees that are stacked in one."""
+    return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], together) for k in range(count))
+
+
+def _refined(solid, scene, phase: Phase, rough, first, resolution: Resolution, tolerance: float) -> Traced:
+    told, holds = (phase.formation, rough, phase.heading), array(phase.arrive == "hold")
+    while True:
+        traced = prepare(solid, scene.hand, scene.gravity, *told, resolution, first, holds)
+        table = traced.table
+        least_error = ROUNDING * jnp.finfo(table.breaks.dtype).eps
+        coarse = float(table.error) > max(tolerance, least_error) and int(table.status) == Status.OK
+        full = int(table.count) >= resolution.pieces
+        if full and resolution.pieces < 48:
+            resolution = resolution._replace(pieces=2 * resolution.pieces, panels=2 * resolution.panels)
+        elif coarse and resolution.panels < 512:
+            resolution = resolution._replace(panels=2 * resolution.panels)
+        elif coarse or full:
+            return eqx.tree_at(lambda t: t.table.status, traced, jnp.asarray(int(Status.NO_CONVERGENCE), int))
+        else:
+            return traced
+
+
+def outcomes(
+    scene: Scene, torque: Torque, traced: tuple[Traced, ...], how: Integration, arrival: float = ARRIVAL
+) -> tuple[Outcome, ...]:
+    """Simulate every phase; differentiable, and usable under any JAX transformation."""
+    alike = len({tuple(leaf.shape for leaf in jax.tree.leaves(one)) for one in traced}) == 1
+    if alike and transformed(scene, torque, traced):
+        phases = stacked([(at.table, *simulate_told(phase)) for at, phase in zip(traced, scene.phases, strict=True)])
+        dtype = torque.times.dtype
+        how = tolerance_as_data(how, dtype)
+        return _apart(_outcomes_together(phases, padded(torque), how, jnp.asarray(arrival, dtype)), len(traced))
+    at, found, schedule = simulate_first(torque), [], padded(torque)
+    for phase, one in zip(scene.phases, traced, strict=True):
+        at, outcome = simulate_next(schedule, how, arrival, at, (one.table, *simulate_told(phase)))
+        found.append(outcome)
+    return tuple(found)
+
+
+@eqx.filter_jit
+def _outcomes_together(phases, schedule: Torque, how: Integration, arrival) -> Outcome:
+    """Every phase of a plan in one program: `Outcome` with an axis of phases."""
+    return jax.lax.scan(partial(simulate_next, schedule, how, arrival), simulate_first(schedule), phases)[1]
+
+
+def simulate_first(torque: Torque):
+    """When a plan begins, when it should, and at which `z_dot`: what `simulate_next` needs of the phases before."""
+    zero = array(0.0, torque.times.dtype)
+    return zero, zero, array(np.zeros(5), zero.dtype)
+
+
+def simulate_told(phase: Phase):
+    """What a plan says of a phase's motion: its duration, its goal, and whether the next takes over at speed."""
+    return phase.duration, array(GOALS[phase.arrive], int), array(phase.arrive == "moving")
+
+
+def simulate_next(schedule: Torque, how: Integration, arrival, at, phase):
+    """Simulate the next phase of a plan, from when the one before it ended: one step of a scan."""
+    (start, planned, arriving), (table, duration, goal, passes) = at, phase
+    planned, length = _planned(planned, duration, start)
+    one = run(table, schedule, start, length, how, goal, arriving, arrival)
+    return _following(planned, passes, one), one
+
+
+@jax.jit  # outside of other programs, one compiles sooner than its operations one by one
+def _planned(before, duration, start):
+    """When a phase should end, and how long it has."""
+    planned = before + duration
+    return planned, planned - start
+
+
+@jax.jit
+def _following(planned, passes, one: Outcome):
+    """When the next phase begins, when this one should have ended, and at which `z_dot`."""
+    ended = one.start + one.duration * one.motion.share[one.motion.count]
+    return jnp.where(passes, ended, planned), planned, jnp.where(passes, one.leaving, 0.0)
+
+
+def margin(
+    scene: Scene,
+    torque: Torque,
+    *,
+    how: Integration = Integration(adjoint="both"),
+    resolution: Resolution = Resolution(),
+) -> Float[Array, ""]:
+    """The compressive margin [N] of a plan: the least `c_n` over time and contacts (and, of those that roll, the least
+    `mu c_n - |c_t|`), formations assumed to hold.
+
+    Differentiable, in forward and reverse mode, with respect to the torques and every float of the scene; negative
+    where a contact would pull; `-inf` where a phase has no motion to score, or its wire is not known. Whether the plan
+    succeeds is for `simulate` to say. Phases that hold the object do not count. That the schedule steps is seen where
+    its times and the durations are numbers; where they are transformed too, say so: `how=Integration(adjoint="both",
+    steps=True)`.
+
+    The forces are those of the paper's section 2.2, its `c_n > 0` (derivation, sections 4 and 7).
+    In float32 it has four digits (`docs/accuracy.md`).
+
+    >>> scene = wa.load("heptagon")
+    >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")
+    0.70 N
+    """
+    how = replace(roomy(how, scene, torque), steps=how.steps or steps_within(scene, torque))
+    return least(scene, outcomes(scene, torque, trace(scene, resolution=resolution), how))
+
+
+def least(scene: Scene, found: tuple[Outcome, ...]) -> Float[Array, ""]:
+    """The least margin [N] of simulated phases, those that hold left out; `-inf` where one has no motion to score.
+
+    Raises ValueError for a plan that only holds its object.
+    """
+    moving = [o.score.margin for o, p in zip(found, scene.phases, strict=True) if p.arrive != "hold"]
+    if not moving:
+        raise ValueError("a plan that only holds its object has no margin of a motion, see Result.hold_margin")
+    return jnp.stack([jnp.where(jnp.isfinite(m), m, -jnp.inf) for m in moving]).min()
+
+
+def require_motion(scene: Scene) -> None:
+    """Raise ValueError for a plan with a phase that holds the object, where only phases that move it make sense."""
+    for phase in scene.phases:
+        if phase.arrive == "hold":
+            raise ValueError(f"phase '{phase.name}' holds the object; this is for phases that move it")
+
+
+def require_covered(scenes: Scene, torque: Torque) -> None:
+    """Raise ValueError for a schedule that is shorter than the plan, or than the longest plan of stacked scenes."""
+    total = float(np.max(sum(np.asarray(p.duration) for p in scenes.phases)))
+    first, last = float(torque.times[0]), float(torque.times[-1])
+    if first > 0 or last < total * (1 - 1e-9):
+        raise ValueError(f"the torque schedule covers {first:g} to {last:g} s, the plan 0 to {total:g} s")
+
+
+def simulate(
+    scene: Scene,
+    torque: Torque,
+    *,
+    tolerance: float = 1e-10,
+    max_steps: int = 256,
+    traced: tuple[Traced, ...] = (),
+    arrival: float = ARRIVAL,
+) -> Result:
+    """Simulate a plan under a torque schedule and judge it.
+
+    `tolerance` is the integrator's; `traced` reuses the result of `trace`; `arrival` is how near its wire's end a phase
+    must come, as a share of the wire's length. Raises ValueError for a schedule that is shorter than the plan, and for
+    a `tolerance`, `max_steps` or `arrival` that is not positive; everything else is a status.
+
+    Integrates the paper's eq. (16) (derivation, section 6). Raises RuntimeError without float64.
+
+    >>> scene = wa.load("heptagon")
+    >>> result = wa.simulate(scene, wa.torque([0.0, 2.0], [[0.0, 0.0], [0.0, 0.0]]))
+    >>> result.status.label, result.phases[0].status.label
+    ('stuck', 'stuck')
+    >>> print(result.message.rpartition(":")[0])
+    slide left: stuck, t = 1 s, at rest since 0 s
+    """
+    require_x64()
+    require_positive(tolerance=tolerance, max_steps=max_steps, arrival=arrival)
+    require_covered(scene, torque)
+    if not traced:
+        compiled = simulate_beside(scene, torque, tolerance, max_steps)
+        traced = trace(scene)
+        wait(compiled)
+    while True:
+        found = outcomes(scene, torque, traced, _integration(scene, torque, tolerance, max_steps), arrival)
+        short = any(int(o.verdict.status) == Status.MAX_STEPS for o in found)
+        if not short or max_steps >= 16384:
+            return describe(scene, torque, traced, found)
+        max_steps *= 4
+
+
+def simulate_beside(scene: Scene, torque: Torque, tolerance: float = 1e-10, max_steps: int = 256) -> Beside:
+    """Compile what `simulate` runs in a thread of its own, while wires are traced; it is to be waited for."""
+    return beside(run_blank, rounded(len(torque.times)), _integration(scene, torque, tolerance, max_steps))
+
+
+def _integration(scene: Scene, torque: Torque, tolerance: float, max_steps: int) -> Integration:
+    """How `simulate` integrates."""
+    stages, steps = max(8, max_steps // 32), steps_within(scene, torque)
+    return roomy(Integration(tolerance=tolerance, max_steps=max_steps, stages=stages, steps=steps), scene, torque)
+
+
+def roomy(how: Integration, scene: Scene, torque: Torque) -> Integration:
+    """The same integration with room for the steps of a phase under a schedule (`stepping.with_room`).
+
+    Counted are the rows within a phase, or all where times or durations are being transformed.
+    """
+    rows = torque.times.shape[0]
+    if not transformed(torque.times, [phase.duration for phase in scene.phases]):
+        ends = np.cumsum([0.0, *(float(phase.duration) for phase in scene.phases)])
+        rows = int(np.max(np.diff(np.searchsorted(np.asarray(torque.times), ends))))
+    return with_room(how, rows)
+
+
+def steps_within(scenes: Scene, torque: Torque) -> bool:
+    """Whether a schedule steps within a phase of a scene, or of one of stacked scenes; times and durations that are
+    being transformed count as they do not."""
+    if transformed(torque.times, [phase.duration for phase in scenes.phases]):
+        return False
+    ends = np.cumsum([np.asarray(phase.duration) for phase in scenes.phases], axis=0)
+    first = 0.0
+    for before, phase, end in zip([None, *scenes.phases], scenes.phases, ends, strict=False):
+        # Who passes on at speed may do so early: then the next phase has what was meant for it.
+        if before is None or before.arrive != "moving":
+            first = float(np.min(end - np.asarray(phase.duration)))
+        if has_steps(torque, first, float(np.max(end))):
+            return True
+    return False

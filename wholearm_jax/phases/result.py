@@ -1,0 +1,153 @@
+"""Results: what became of a plan and of each of its phases, readable.
+
+Where friction holds the object at rest, `holding` says whether the contacts can, and with which margin.
+"""
+
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+
+from wholearm_jax.core.status import Status
+from wholearm_jax.margin.statics import Held, statics, watch
+from wholearm_jax.model.scene import Phase, Scene
+from wholearm_jax.model.schedule import Torque
+from wholearm_jax.phases.phase import Outcome, Traced, configuration
+
+SLIPPING = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
+BRIEF = 1e-9  # share of a phase: an object that comes to rest at its end does so earlier or later by rounding
+
+
+@dataclass(frozen=True)
+class PhaseResult:
+    """A simulated phase, readable: times in seconds from the plan's start, contacts by name, forces in newtons.
+
+    `time` is when the phase ended or failed. A phase that is entered while moving begins at `start` with `impulses`
+    [N s], one a contact.
+    `slips` says that the contact lost is one that should roll, and that it leaves its friction cone.
+    `margin` is the least force while the object moves; while friction holds it at rest forces are not determined, and
+    `holds` says what the contacts can do. A phase that only holds has the margin of its hold.
+    """
+
+    name: str
+    arrive: str
+    contacts: tuple[str, ...]
+    status: Status
+    time: float
+    contact: str | None
+    slips: bool
+    start: float
+    duration: float
+    margin: float
+    margin_time: float
+    margin_s: float
+    margin_contact: str
+    impulses: tuple[float, ...]
+    holds: tuple[Held, ...]
+    traced: Traced
+    outcome: Outcome
+
+    @property
+    def message(self) -> str:
+        """One line: which phase, what, which contact, when."""
+        if self.status is Status.OK:
+            return f"{self.name}: ok, margin {self.margin:.4g} N at {self.margin_contact}, t = {self.margin_time:.4g} s"
+        whose = f" at {self.contact}" if self.contact else ""
+        advice = SLIPPING if self.slips else self.status.advice
+        rests = self.status is Status.STUCK and self.holds
+        since = f", at rest since {self.holds[-1].start:.6g} s" if rests else ""
+        return f"{self.name}: {self.status.label}{whose}, t = {self.time:.6g} s{since}: {advice}"
+
+
+@dataclass(frozen=True)
+class Result:
+    """A simulated plan. `status` is that of the first phase that is not ok.
+
+    `margin` [N] is the least over its phases, those that only hold left out unless there are no others; `hold_margin`
+    is the least of its holds, None without any.
+    """
+
+    scene: Scene
+    torque: Torque
+    phases: tuple[PhaseResult, ...]
+
+    @property
+    def status(self) -> Status:
+        return next((p.status for p in self.phases if p.status is not Status.OK), Status.OK)
+
+    @property
+    def hardest(self) -> PhaseResult:
+        """The phase whose margin is the plan's."""
+        moving = [p for p in self.phases if p.arrive != "hold"]
+        return min(moving or self.phases, key=lambda p: p.margin)
+
+    @property
+    def margin(self) -> float:
+        return self.hardest.margin
+
+    @property
+    def hold_margin(self) -> float | None:
+        return min((held.margin for p in self.phases for held in p.holds), default=None)
+
+    @property
+    def message(self) -> str:
+        """What became of the plan, in one line."""
+        failed = (p.message for p in self.phases if p.status is not Status.OK)
+        return next(failed, f"ok, margin {self.margin:.4g} N")
+
+
+def describe(scene: Scene, torque: Torque, traced, found) -> Result:
+    """Arrays as a readable result."""
+    rows = []
+    for phase, at, outcome in zip(scene.phases, traced, found, strict=True):
+        names, start, length = phase.formation.names, float(outcome.start), float(outcome.duration)
+        verdict, scored = outcome.verdict, outcome.score
+        slot, of_slot = int(verdict.contact), phase.formation.contact_of_slot
+        known = bool(np.isfinite(scored.margin)) and int(at.table.status) == Status.OK
+        one = PhaseResult(
+            name=phase.name,
+            arrive=phase.arrive,
+            contacts=names,
+            status=Status(int(verdict.status)),
+            time=start + length * float(verdict.share),
+            contact=names[of_slot[slot]] if slot >= 0 else None,
+            slips=slot >= 0 and bool(phase.formation.tangential[slot]),
+            start=start,
+            duration=length,
+            margin=float(scored.margin) if known else float("-inf"),
+            margin_time=start + length * float(scored.share),
+            margin_s=float(scored.s),
+            margin_contact=names[of_slot[int(scored.contact)]],
+            impulses=tuple(float(np.asarray(outcome.entered.impulse)[k]) for k in phase.formation.normal_slots),
+            holds=stays(scene, torque, phase, at, outcome),
+            traced=at,
+            outcome=outcome,
+        )
+        rows.append(_with_holds(one))
+    return Result(scene, torque, tuple(rows))
+
+
+def stays(scene: Scene, torque: Torque, phase: Phase, traced: Traced, outcome: Outcome) -> tuple[Held, ...]:
+    """Every time that friction holds the object at rest in a phase: waiting to start, or stopped on the way."""
+    motion = jax.device_get(outcome.motion)
+    if int(traced.table.status) != Status.OK:
+        return ()
+    start, duration = float(outcome.start), float(outcome.duration)
+    found = []
+    for k in np.flatnonzero(motion.held[: int(motion.count)] & (np.diff(motion.share)[: int(motion.count)] > BRIEF)):
+        z = configuration(traced.table, motion.piece[k], motion.s[k])
+        begin, end = (start + duration * float(share) for share in motion.share[k : k + 2])
+        found.append(watch(statics(scene, phase.formation, z), torque, begin, end))
+    return tuple(found)
+
+
+def _with_holds(phase: PhaseResult) -> PhaseResult:
+    """A phase is lost where the contacts cannot hold the object; one that only holds has its hold's margin."""
+    if phase.arrive == "hold" and phase.holds:
+        least = min(phase.holds, key=lambda held: held.margin)
+        numbers = {"margin": least.margin, "margin_time": least.time, "margin_contact": least.contact}
+        phase = replace(phase, **numbers, margin_s=float(phase.traced.table.breaks[0]))
+    failed = next((held for held in phase.holds if held.lost is not None), None)
+    if failed is None or failed.lost is None or (phase.status is not Status.OK and phase.time < failed.lost):
+        return phase
+    return replace(phase, status=Status.CONTACT_LOST, time=failed.lost, contact=failed.contact, slips=False)

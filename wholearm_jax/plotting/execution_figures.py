@@ -1,0 +1,155 @@
+"""Figures of executions: contact forces, deviation and contacts over time, poses, and an animation.
+
+Functions take and return axes as those of `drawing` do.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.animation import FuncAnimation
+from matplotlib.axes import Axes
+from matplotlib.patches import Polygon as Patch
+
+from wholearm_jax.model.scene import body, pair_name
+from wholearm_jax.plotting.palette import CONTACT_COLOURS, contact_styles
+from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
+from wholearm_jax.plotting.plan_figures import INK, PAGE, PALE, draw_pose, outline_at, over_time, pose_grid
+
+if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
+    from wholearm_jax.execution.rollout import Execution
+
+
+def draw_execution(execution: Execution, axes=None) -> np.ndarray:
+    """An execution on top of its prediction: contact forces, deviation of the object, and which contacts touch.
+
+    Takes and returns three axes.
+    """
+    if axes is None:
+        ratios = (3, 1.2, 0.22 * len(execution.planned) + 0.3)
+        size = (PAGE, 6.0)
+        _, axes = plt.subplots(3, 1, figsize=size, sharex=True, layout="constrained", height_ratios=ratios)
+    draw_execution_forces(execution, axes[0])
+    draw_deviation(execution, axes[1])
+    draw_touch(execution, axes[2])
+    for ax in axes[:2]:
+        ax.set_xlabel("")
+    return np.asarray(axes)
+
+
+def draw_execution_strip(execution: Execution, poses: int = 8, axes=None) -> np.ndarray:
+    """An execution as a strip of poses, the predicted object dashed; takes and returns an array of axes."""
+    axes = pose_grid(axes, 2, (poses + 1) // 2, 0.95)
+    shown = np.linspace(0, len(execution.course.time) - 1, axes.size).round().astype(int)
+    for ax, row in zip(axes.flat, shown, strict=True):
+        _draw_moment(execution, row, ax)
+    return axes
+
+
+def animate(execution: Execution, frames_per_second: int = 25, ax: Axes | None = None) -> FuncAnimation:
+    """An execution in real time, the predicted object dashed."""
+    times = execution.course.time
+    count = max(2, round(times[-1] * frames_per_second) + 1)
+    shown = np.searchsorted(times, np.linspace(0, times[-1], count) - 1e-9)
+    ax = ax or plt.figure(figsize=(4.8, 3.6), layout="constrained").add_subplot()
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    reach = np.asarray(execution.prediction.scene.hand.length).max()
+    across = np.abs(np.asarray(execution.prediction.scene.hand.joint)[:, 0]).max() + reach
+
+    def show(row):
+        ax.clear()
+        _draw_moment(execution, row, ax)
+        ax.set_xlim(-across, across)
+        ax.set_ylim(-0.1 * reach, 1.2 * reach)
+        return ()
+
+    return FuncAnimation(figure, show, frames=shown, interval=1000 / frames_per_second)
+
+
+def _draw_moment(execution: Execution, row: int, ax: Axes) -> None:
+    """The executed pose of one step, and the predicted object's outline."""
+    time = execution.course.time[row]
+    draw_pose(execution.prediction.scene, execution.course.z[row], ax, label=f"$t$ = {time:.2f} s")
+    expected = execution.expected
+    if time <= expected.time[-1] + 1e-9:
+        z = expected.z[min(np.searchsorted(expected.time, time - 1e-9), len(expected.time) - 1)]
+        outline = outline_at(execution.prediction.scene, z)
+        ax.add_patch(Patch(outline, closed=True, fill=False, edgecolor=COLOURS[1], lw=0.8, ls="--", zorder=4))
+
+
+def draw_execution_forces(execution: Execution, ax: Axes | None = None) -> Axes:
+    """Executed contact forces [N] over time, thin, on those that were predicted, pale and wide."""
+    ax = ax or plt.gca()
+    expected = execution.expected
+    for name in execution.planned:
+        column = execution.names.index(name)
+        colour = _colour(execution, name)
+        predicted = np.where(expected.cn[:, column] == 0, np.nan, expected.cn[:, column])
+        ax.plot(expected.time, predicted, color=colour, lw=3.5, alpha=0.35, solid_capstyle="butt")
+        executed = execution.course.cn[:, column]
+        ax.plot(execution.course.time, np.where(executed > 0, executed, np.nan), color=colour, lw=0.9, label=name)
+    # What contacts do as they are made would hide the rest; where no forces are predicted, they are all there is.
+    high = np.nanmax(np.where(np.isfinite(expected.cn), expected.cn, 0.0)) or execution.course.cn.max() or 1.0
+    ax.set_ylim(-0.03 * high, 1.35 * high)
+    ax.plot([], [], color=PALE, lw=3.5, alpha=0.6, label="predicted")
+    ax.set_ylabel("contact force $c_n$ [N]")
+    over_time(ax, execution.prediction)
+    return _legend_beside(ax)
+
+
+def draw_deviation(execution: Execution, ax: Axes | None = None) -> Axes:
+    """How far the executed object is from the predicted one over time [mm]: its centre, and its angle at its rim."""
+    ax = ax or plt.gca()
+    course, expected = execution.course, execution.expected
+    z = np.stack([np.interp(expected.time, course.time, course.z[:, k]) for k in range(3)], axis=1)
+    off = z - expected.z[:, :3]
+    corners = np.asarray(body(execution.prediction.scene.object).vertices)
+    rim = 1e3 * np.hypot(*corners.T).max() * np.abs(off[:, 2])
+    ax.plot(expected.time, 1e3 * np.hypot(off[:, 0], off[:, 1]), color=COLOURS[0], label="centre of mass")
+    ax.plot(expected.time, rim, color=COLOURS[1], ls="--", label="angle, at its rim")
+    over_time(ax, execution.prediction, named=False)
+    ax.set_ylim(bottom=0)
+    ax.set_ylabel("deviation [mm]")
+    return _legend_beside(ax)
+
+
+def draw_touch(execution: Execution, ax: Axes | None = None) -> Axes:
+    """A pale bar while a contact is predicted to touch, and a full one within it while it does."""
+    ax = ax or plt.gca()
+    shown = [n for n in execution.names if n in execution.planned or _touches(execution, n)]
+    for place, name in enumerate(shown):
+        column = execution.names.index(name)
+        colour = _colour(execution, name) if name in execution.planned else INK
+        for course, height, alpha in ((execution.expected, 0.8, 0.35), (execution.course, 0.3, 1.0)):
+            for begin, end in _spans(course.time, course.touch[:, column]):
+                ax.barh(place, end - begin, left=begin, height=height, color=colour, alpha=alpha, lw=0)
+    over_time(ax, execution.prediction, named=False, zero=False)
+    ax.set_yticks(range(len(shown)), shown)
+    ax.set_ylim(len(shown) - 0.5, -0.5)
+    return ax
+
+
+def _touches(execution: Execution, name: str) -> bool:
+    column = execution.names.index(name)
+    return bool(execution.course.touch[:, column].any() or execution.expected.touch[:, column].any())
+
+
+def _spans(times, flags):
+    """Intervals of time in which a flag holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    last = len(times) - 1
+    return [(times[begin], times[min(end, last)]) for begin, end in edges.reshape(-1, 2)]
+
+
+def _colour(execution: Execution, name: str) -> str:
+    """The colour of a contact of the plan."""
+    styles = contact_styles(map(pair_name, phase.contacts) for phase in execution.prediction.phases)
+    return CONTACT_COLOURS[styles[name][0]]
+
+
+def _legend_beside(ax: Axes) -> Axes:
+    ax.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return ax

@@ -1,0 +1,319 @@
+r"""Simulate: one phase as a scalar second-order ODE along its wire, integrated by diffrax's solvers.
+
+Time runs as a share `u` of the phase's duration `T`, and `w = v T` is the speed in `s` per duration, so that steps and
+tolerances mean the same for every size and duration:
+
+    ds/du = w,    dw/du = T^2 (A0 + A3 tau1 + A4 tau2) + T A2 w + A1 w^2
+
+with the coefficients of `reduction.Table`. A phase is a sequence of smooth stages. Each stage is a run of steps
+that end on the torque's knots; it stops at the first step that leaves the piece or turns the speed negative.
+That step is then taken again with the length that lands exactly on the piece's end, or on rest, so that the method
+keeps its order across slip reversals and the landing carries its own derivatives.
+
+At rest, with friction, the object starts forward when the acceleration with forward signs is positive, backward when
+the one with backward signs is negative, and stays when neither is; both at once is ambiguous (Painleve).
+
+Derivation: section 6 of `docs/derivation.md`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
+
+from wholearm_jax.core.lookup import pick
+from wholearm_jax.core.small_linalg import times
+from wholearm_jax.core.status import Status
+from wholearm_jax.dynamics.path_dynamics import Table, on_panel, powers
+from wholearm_jax.model.schedule import Window, interval, torque_in
+from wholearm_jax.simulation.event_step import acceleration, land
+from wholearm_jax.simulation.integrator import Integration, Steps, Stop, found, repeated, reversible
+
+
+class Motion(NamedTuple):
+    """The accepted steps of a phase, `count` of them: from node `i` to node `i + 1` in time, `s` and `w`.
+
+    Step `i` lies in piece `piece[i]` and torque interval `row[i]`; `held[i]` marks waiting at rest. `share` is time in
+    durations. Rows beyond `count` repeat the end. `status` is that of the end alone: `ok` (end of time while moving),
+    `left_formation` (the wire's end), `stuck`, `reversed`, `ambiguous`, `no_convergence` (a landing) or `max_steps`.
+    """
+
+    share: Float[Array, "nodes"]
+    s: Float[Array, "nodes"]
+    w: Float[Array, "nodes"]
+    entry_w: Float[Array, "steps"]
+    piece: Int[Array, "steps"]
+    row: Int[Array, "steps"]
+    held: Bool[Array, "steps"]
+    count: Int[Array, ""]
+    status: Int[Array, ""]
+
+
+class _State(NamedTuple):
+    share: Float[Array, ""]
+    s: Float[Array, ""]
+    w: Float[Array, ""]
+    piece: Int[Array, ""]
+    count: Int[Array, ""]
+    status: Int[Array, ""]
+    done: Bool[Array, ""]
+    nodes: Float[Array, "nodes 3"]
+    entry_w: Float[Array, "steps"]
+    pieces: Int[Array, "steps"]
+    rows: Int[Array, "steps"]
+    held: Bool[Array, "steps"]
+
+
+def move(
+    table: Table,
+    seen: Window,
+    duration: Float[Array, ""],
+    *,
+    how: Integration,
+    s: Float[Array, ""] | None = None,
+    speed: Float[Array, ""] | float = 0.0,
+    free: bool | Bool[Array, ""] = False,
+) -> Motion:
+    """Move along a wire for one phase, from its start (or `s`) at `speed` [1/s].
+
+    `free` lets the motion pass rest and the wire's end with forward signs: a smooth continuation that optimisation may
+    differentiate, not physics; only an honest run (`free=False`) decides what happens.
+    """
+    capacity = how.max_steps
+    dtype = table.breaks.dtype
+    begin = table.breaks[0] if s is None else jnp.asarray(s, dtype)
+    w = jnp.asarray(speed, dtype) * duration
+    first = jnp.stack([jnp.zeros((), dtype), begin, w])
+    state = _State(
+        share=first[0],
+        s=begin,
+        w=w,
+        piece=jnp.asarray(0, int),
+        count=jnp.asarray(0, int),
+        status=jnp.asarray(int(Status.MAX_STEPS), int),
+        done=jnp.asarray(False),
+        nodes=jnp.broadcast_to(first, (capacity + 1, 3)),
+        entry_w=jnp.zeros(capacity, dtype),
+        pieces=jnp.zeros(capacity, int),
+        rows=jnp.broadcast_to(seen.first.astype(int), capacity),
+        held=jnp.zeros(capacity, bool),
+    )
+    free = jnp.asarray(free)
+
+    def stage(state):
+        return _stage(table, seen, duration, how, free, state)
+
+    if how.adjoint in ("none", "forward"):
+        state = _repeated(stage, state, how.stages)
+    else:  # reverse mode must know how often
+
+        def once(state, _):
+            return jax.lax.cond(state.done, lambda s: s, stage, state), None
+
+        state, _ = jax.lax.scan(once, state, None, length=how.stages)
+    beyond = jnp.arange(capacity + 1) > state.count
+    nodes = jnp.where(beyond[:, None], state.nodes[state.count], state.nodes)
+    return Motion(
+        share=nodes[:, 0],
+        s=nodes[:, 1],
+        w=nodes[:, 2],
+        entry_w=state.entry_w,
+        piece=state.pieces,
+        row=state.rows,
+        held=state.held,
+        count=state.count,
+        status=state.status.astype(int),
+    )
+
+
+def _repeated(stage, state: _State, most: int) -> _State:
+    """Stage after stage until all is done, at most so many."""
+
+    def going(loop):
+        count, state = loop
+        return ~state.done & (count < most)
+
+    return jax.lax.while_loop(going, lambda loop: (loop[0] + 1, stage(loop[1])), (jnp.asarray(0, int), state))[1]
+
+
+def _stage(table, seen, duration, how, free, state: _State) -> _State:
+    """Wait at rest if need be, then move until the piece ends, the object stops, or time is over."""
+    state, verdict, room = _wait(table, seen, how, free, state)
+    blocked = verdict != int(Status.OK)
+    last = state.piece >= table.count - 1
+    goal = pick(table.breaks, state.piece + 1) + jnp.where(free & last, jnp.inf, 0.0)
+    floor = jnp.where(free, -jnp.inf, 0.0)
+    final = jnp.where(blocked, state.share, 1.0)
+
+    steps = _integrate(table, seen, duration, how, state, final, goal, floor)
+    overshot = steps.passed
+    last_step = jnp.maximum(steps.count - 1, 0)
+    last_time, row = jnp.where(overshot, pick(steps.end, last_step), 1.0), pick(steps.row, last_step)
+    state, complete = _recorded(state, steps, overshot, room)
+    node = state.share, state.s, state.w
+    landed = land(table, seen, duration, how, state.piece, row, node, last_time, goal, floor, overshot)
+    land_share, land_s, land_w, passed, astray = landed
+    state = _append(state, overshot, land_share, land_s, land_w, state.w, row, held=False)
+    onward = passed & ~last
+    factor = table.factor[jnp.minimum(state.piece + 1, table.factor.shape[0] - 1)]
+    # `done` waits for the next stage where the object has come to rest: it may start again.
+    status = jnp.select(
+        [~complete, blocked, astray, passed & last, overshot],
+        [
+            int(Status.MAX_STEPS),
+            verdict,
+            *(int(s) for s in (Status.NO_CONVERGENCE, Status.LEFT_FORMATION, Status.MAX_STEPS)),
+        ],
+        int(Status.OK),
+    )
+    return state._replace(
+        share=jnp.where(overshot, land_share, state.share),
+        s=jnp.where(overshot, land_s, state.s),
+        w=jnp.where(overshot, land_w, state.w) * jnp.where(onward, factor, 1.0),
+        piece=state.piece + onward,
+        status=status,
+        done=blocked | ~complete | astray | (passed & last) | ~overshot,
+    )
+
+
+def _wait(table, seen, how, free, state: _State):
+    """Wait while friction holds an object that is at rest: the state then, what it does, and room in the record."""
+    rest = (state.w <= 0) & ~free
+    share, verdict = _departure(table, seen, state)
+    share = jnp.where(rest, share, state.share)
+    verdict = jnp.where(rest, verdict, int(Status.OK))
+    waited = rest & (share > state.share)
+    room = how.max_steps - state.count - waited
+    row = interval(seen, stop_gradient(state.share + share) / 2)
+    state = _append(state, waited, share, state.s, state.w, state.w, row, held=True)
+    return state._replace(share=share), verdict, room
+
+
+def _recorded(state: _State, steps: Steps, overshot, room):
+    """Record steps but the last one where it `overshot`: the state after them, whether the record holds them."""
+    capacity = state.entry_w.shape[0]
+    y0 = jnp.stack([state.s, state.w])
+    # The record is as long as one stage may be; several stages together may need more.
+    complete = steps.complete & (steps.count <= room)
+    rows = jnp.arange(capacity)
+    kept = jnp.clip(jnp.where(overshot, steps.count - 1, steps.count), 0, jnp.maximum(room, 0))
+    start = state.count
+    place = jnp.where(rows < kept, start + 1 + rows, capacity + 1)
+    recorded = jnp.concatenate([steps.end[:, None], steps.y], axis=1)
+    nodes = state.nodes.at[place].set(recorded, mode="drop")
+    entered = jnp.concatenate([y0[1:], steps.y[:-1, 1]])
+    share, s, w = pick(nodes, start + kept)
+    state = state._replace(
+        share=share,
+        s=s,
+        w=jnp.where(kept > 0, w, y0[1]),  # a node at a chart's end holds the speed in the chart before
+        nodes=nodes,
+        entry_w=state.entry_w.at[place - 1].set(entered, mode="drop"),
+        pieces=state.pieces.at[place - 1].set(state.piece, mode="drop"),
+        rows=state.rows.at[place - 1].set(steps.row, mode="drop"),
+        count=start + kept,
+    )
+    return state, complete
+
+
+def _integrate(table, seen, duration, how, state, final, goal, floor) -> Steps:
+    """Steps from the state to `final` or to the first that passes `goal` or falls below the speed `floor`."""
+    limits, final = stop_gradient(((goal, floor), final))
+    way = limits[0] - stop_gradient(state.s)
+    least = how.tolerance + 64 * jnp.finfo(state.s.dtype).eps * jnp.abs(stop_gradient(state.s))
+    parameters = table, duration, state.piece
+    begin, y = state.share, jnp.stack([state.s, state.w])
+    if how.adjoint == "reverse":
+        return reversible((parameters, seen, begin, y), _field, _stop, how, final, (*limits, least), way)
+
+    def solve(method, parameters, seen, begin, y, *more):
+        return method(_field(parameters, seen), seen, how, begin, final, y, *more)
+
+    inputs = parameters, seen, begin, y
+    fixed = inputs if how.adjoint == "none" else stop_gradient(inputs)
+    steps = solve(found, *fixed, _stop((*limits, least)), way)
+    return steps if how.adjoint == "none" else solve(repeated, *inputs, steps)
+
+
+def _field(parameters, seen: Window):
+    """`d(s, w)/du` in a piece, for `stepping`."""
+    table, duration, piece = parameters
+
+    def field(u, y, row):
+        return jnp.stack([y[1], acceleration(table, seen, duration, piece, row, u, y[0], y[1])])
+
+    return field
+
+
+def _stop(limits) -> Stop:
+    """A state past the goal or below the floor, a speed; and a step on which the object may have come to rest and set
+    out again: one of the coefficients of `ds/du` by Bernstein's polynomials is negative, between which it stays.
+
+    Those of the quartic with the right speeds and accelerations at both ends and the right way between them. Going back
+    by the `least` way, which the tolerance does not see, does not count.
+    """
+    goal, floor, least = limits
+
+    def past(y):
+        return (y[0] > goal) | (y[1] < floor)
+
+    def between(y, after, rates, width):
+        first, last = rates[0][0], rates[1][0]
+        second, fourth = first + rates[0][1] * width / 4, last - rates[1][1] * width / 4
+        third = 5 * (after[0] - y[0]) - first - second - fourth - last
+        lowest = jnp.minimum(jnp.minimum(second, third), fourth)
+        return jnp.isfinite(floor) & (after[1] >= floor) & (lowest < -least)
+
+    return Stop(past, between)
+
+
+def _append(state, wanted, share, s, w, entry_w, row, *, held):
+    """Add one step to the record where `wanted`."""
+    capacity = state.entry_w.shape[0]
+    place = jnp.where(wanted & (state.count < capacity), state.count + 1, capacity + 1)
+    return state._replace(
+        nodes=state.nodes.at[place].set(jnp.stack([share, s, w]), mode="drop"),
+        entry_w=state.entry_w.at[place - 1].set(entry_w, mode="drop"),
+        pieces=state.pieces.at[place - 1].set(state.piece, mode="drop"),
+        rows=state.rows.at[place - 1].set(row, mode="drop"),
+        held=state.held.at[place - 1].set(held, mode="drop"),
+        count=state.count + (place <= capacity),
+    )
+
+
+def _departure(table, seen, state):
+    """When an object at rest at `s` starts to move, and what it does: `ok`, `reversed`, `ambiguous` or `stuck`.
+
+    The accelerations at rest are linear in the torque, hence piecewise linear in time: their first signs are exact.
+    """
+    panel, xi = powers(table, state.piece, state.s)
+    ahead = on_panel(table.acceleration, panel, xi)[jnp.array([0, 3, 4])]
+    behind = -on_panel(table.backward, panel, xi)
+    rows = jnp.arange(seen.slope.shape[0])
+    low = jnp.maximum(seen.share[:-1], state.share)
+    high = jnp.minimum(seen.share[1:], 1.0)
+    live = (rows >= seen.first) & (rows <= seen.last) & (high >= low)
+    # Who starts as an interval ends starts with the next one: no step fits in between.
+    inside = high - 8 * jnp.finfo(high.dtype).eps
+    tau_low = jax.vmap(torque_in, (None, 0, 0))(seen, rows, low)
+
+    def first(pull):
+        value = pull[0] + times(tau_low, pull[1:])
+        rate = times(seen.slope, pull[1:])
+        root = low - value / jnp.where(rate > 0, rate, 1.0)
+        at = jnp.where(value > 0, low, jnp.where((rate > 0) & (root < inside), root, jnp.inf))
+        at = jnp.where(live, at, jnp.inf)
+        k = jnp.argmin(stop_gradient(at))
+        return at[k]
+
+    forward, backward = first(ahead), first(behind)
+    both = (forward == backward) & jnp.isfinite(forward)
+    verdict = jnp.select(
+        [both, forward < backward, backward < forward],
+        [int(Status.AMBIGUOUS), int(Status.OK), int(Status.REVERSED)],
+        int(Status.STUCK),
+    )
+    at = jnp.minimum(forward, backward)
+    return jnp.where(jnp.isfinite(at), jnp.where(jnp.isfinite(at), at, 0.0), 1.0), verdict

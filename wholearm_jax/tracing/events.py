@@ -1,0 +1,120 @@
+r"""Watch: what may end a wire, as rows of one table, and which of them a step of the march crosses.
+
+Gaps of contacts that might be made, room on the features of those that hold, a coordinate's limit: each ends the wire
+where it turns negative, or dips below zero and returns within a step; a vertex behind a finger where its gap turns
+positive. All are the same function of a contact, with weights of their own,
+
+    value = a gap + b along + c z_k + shift,
+
+so that a step computes them side by side.
+
+Derivation: section 3 of `docs/derivation.md`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from wholearm_jax.model.contact_kinematics import Contacts, along_rates, frames, gap_rates
+from wholearm_jax.model.mechanics import System
+from wholearm_jax.model.scene import Heading
+
+
+class Watched(NamedTuple):
+    """Values that stay positive on a wire, their rates `d/ds`, and places along features."""
+
+    values: Float[Array, "rows"]
+    rates: Float[Array, "rows"]
+    along: Float[Array, "rows"]
+
+
+class Watch(NamedTuple):
+    """What is watched: all pairs that may touch (`System.candidates`), room before and behind each contact on its
+    feature, and a coordinate's limit.
+
+    `gap`, `along`, `limit` and `shift` are the weights of a row's value. A pair ends the wire within `[lower, upper]`
+    of its feature, and if it `counts`; `behind` marks vertices that may lie behind a link.
+    """
+
+    contacts: Contacts
+    gap: Float[Array, "rows"]
+    along: Float[Array, "rows"]
+    limit: Float[Array, "rows"]
+    shift: Float[Array, "rows"]
+    coordinate: Int[Array, ""]
+    lower: Float[Array, "rows"]
+    upper: Float[Array, "rows"]
+    counts: Bool[Array, "rows"]
+    behind: Bool[Array, "rows"]
+
+    def at(self, z: Float[Array, "5"], slope: Float[Array, "5"]) -> Watched:
+        """What is watched at a place of the wire, where `z` changes by `slope` a unit of `s`."""
+        here = frames(self.contacts, z)
+        return Watched(
+            values=self.gap * here.gap + self.along * here.along + self.limit * z[self.coordinate] + self.shift,
+            rates=self.gap * gap_rates(self.contacts, z, slope)
+            + self.along * along_rates(self.contacts, z, slope)
+            + self.limit * slope[self.coordinate],
+            along=here.along,
+        )
+
+
+def watch_of(system: System, heading: Heading, z: Float[Array, "5"]) -> Watch:
+    """What is watched on a formation's wire from `z` on."""
+    pairs, held, until = system.candidates, system.contacts, heading.until_coordinate >= 0
+    sense = jnp.where(heading.until_value < z[heading.until_coordinate], -1.0, 1.0)
+    one, none, far = jnp.ones_like(held.lower), jnp.zeros_like(held.lower), jnp.full_like(held.lower, jnp.inf)
+    every, nothing = jnp.ones_like(pairs.lower), jnp.zeros_like(pairs.lower)
+
+    def rows(of_pairs, before, behind, of_limit):
+        return jnp.concatenate([of_pairs, before, behind, jnp.reshape(of_limit, 1)])
+
+    return Watch(
+        contacts=jax.tree.map(lambda a, b: rows(a, b, b, b[0]), pairs, held),
+        gap=rows(every, none, none, 0.0),
+        along=rows(nothing, one, -one, 0.0),
+        limit=rows(nothing, none, none, jnp.where(until, -sense, 0.0)),
+        shift=rows(nothing, -held.lower, held.upper, jnp.where(until, sense * heading.until_value, 1.0)),
+        coordinate=heading.until_coordinate,
+        lower=rows(pairs.lower, -far, -far, -jnp.inf),
+        upper=rows(pairs.upper, far, far, jnp.inf),
+        counts=rows(system.watched, one > 0, one > 0, True),
+        behind=rows(system.behind, one < 0, one < 0, False),
+    )
+
+
+def crossings(watch: Watch, before: Watched, after: Watched, step, tolerance):
+    """Which watched values turn negative within a step (or dip below zero and return), and at what share of it.
+
+    The share is a root of the cubic through values and rates: several things that end a wire within the shortest step
+    are told apart to 1e-13.
+    """
+    # A vertex behind a link, within its length, stops at its back; one misplaced there comes out.
+    sense = jnp.where((before.values < -tolerance) & watch.behind, -1.0, 1.0)
+    old, new, leaving, arriving = sense * before.values, sense * after.values, sense * before.rates, sense * after.rates
+    # From either side what is within the tolerance counts as in front.
+    through = (old >= -tolerance) & (new < -sense * tolerance)
+    slope = jnp.where(arriving > leaving, arriving - leaving, 1.0)
+    turns = (leaving < 0) & (arriving > 0) & (old > tolerance)
+    sinks = turns & (old - step * leaving**2 / (2 * slope) < 0)
+    dips = sinks & (new > tolerance)
+
+    def placed():
+        """Most steps cross nothing: there all this is left out."""
+        line = jnp.clip(old / jnp.where(through, old - new, 1.0), 0.0, 1.0)
+        bend = jnp.sqrt(jnp.where(sinks, leaving**2 - 2 * old * slope / step, 0.0))
+        # What comes back is met on its way down.
+        where = jnp.where(through & ~sinks, line, (-leaving - bend) / slope)
+        low, high = step * leaving, step * arriving
+        square, cube = 3 * (new - old) - 2 * low - high, low + high - 2 * (new - old)
+        for _ in range(2):
+            rate = low + where * (2 * square + 3 * where * cube)
+            better = where - (old + where * (low + where * (square + where * cube))) / jnp.where(rate < 0, rate, -1.0)
+            where = jnp.where((rate < 0) & (better >= 0) & (better <= 1), better, where)
+        at = before.along + (after.along - before.along) * where
+        inside = (at >= watch.lower - tolerance) & (at <= watch.upper + tolerance)
+        return (through | dips) & inside & watch.counts, where
+
+    return jax.lax.cond(jnp.any(through | dips), placed, lambda: (through & dips, jnp.zeros_like(old)))
