@@ -32,9 +32,9 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 import wholearm_jax as wa
-from wholearm_jax.ensembles.batch import BLOCK, QUICK, check_scene
-from wholearm_jax.ensembles.ensemble import vary
-from wholearm_jax.model.schedule import Torque, padded
+from wholearm_jax.ensembles.batch import BLOCK, COARSE_PASS, check_scene
+from wholearm_jax.ensembles.ensemble import make_ensemble
+from wholearm_jax.model.schedule import TorqueSchedule, pad_schedule
 
 HERE = Path(__file__).parent
 COUNTS = (128, 1024, 8192, 65_536, 1_000_000)
@@ -104,7 +104,7 @@ def scaling(ensemble, torque) -> dict:
 
 def same_geometry(torque) -> dict:
     """Checks of objects that differ in friction and mass alone: their wires are one another's."""
-    ensemble = vary(wa.load("heptagon"), {"mass": "5%", "friction": "10%"}, seed=1)
+    ensemble = make_ensemble(wa.load("heptagon"), {"mass": "5%", "friction": "10%"}, seed=1)
     wa.check(ensemble, torque, count=BLOCK, arrival=ARRIVAL)
     begun = time.perf_counter()
     wa.check(ensemble, torque, count=ALIKE, arrival=ARRIVAL)
@@ -116,7 +116,7 @@ def same_geometry(torque) -> dict:
 def one_phase(torque) -> dict:
     """Checks of the first phase alone, a second of motion."""
     scene = wa.load("heptagon")
-    ensemble = vary(replace(scene, phases=scene.phases[:1]), VARIED, seed=1)
+    ensemble = make_ensemble(replace(scene, phases=scene.phases[:1]), VARIED, seed=1)
     wa.check(ensemble, torque, count=BLOCK, arrival=ARRIVAL)
     begun = time.perf_counter()
     wa.check(ensemble, torque, count=ALIKE, arrival=ARRIVAL)
@@ -127,12 +127,12 @@ def one_phase(torque) -> dict:
 
 def gradients(ensemble, torque) -> dict:
     """Checks with the gradient with respect to all torques, a block at a time."""
-    schedule, how = padded(torque), QUICK.how
-    level = QUICK._replace(how=replace(how, adjoint="reverse", steps=bool(np.any(np.diff(torque.times) == 0))))
+    schedule, how = pad_schedule(torque), COARSE_PASS.how
+    level = COARSE_PASS._replace(how=replace(how, adjoint="reverse", steps=bool(np.any(np.diff(torque.times) == 0))))
 
     def one(number):
         def margin(values):
-            answer, _ = check_scene(ensemble.draw(number), Torque(schedule.times, values), ARRIVAL, level)
+            answer, _ = check_scene(ensemble.draw(number), TorqueSchedule(schedule.times, values), ARRIVAL, level)
             return answer.margin
 
         return jax.value_and_grad(margin)(schedule.values)
@@ -199,7 +199,7 @@ def roll_out(models, starts, torques) -> None:
 
 def rollouts(ensemble, torque) -> dict:
     """MuJoCo, its own friction, all threads: rates at the longest time step that still ends near the prediction."""
-    from wholearm_jax.execution.mujoco_model import CONVEX, free_bodies
+    from wholearm_jax.execution.mujoco_model import CONVEX, build_mujoco_model
     from wholearm_jax.execution.rollout import clock, execute, motor_torques
 
     prediction, scenes, starts = laid_in(ensemble, torque)
@@ -210,7 +210,7 @@ def rollouts(ensemble, torque) -> dict:
     for wanted in STEPS:
         done = execute(prediction, timestep=wanted, softness=CONVEX)
         begins, step = clock(ensemble.scene, wanted)
-        models = [free_bodies(s, step, CONVEX).model for s in scenes]
+        models = [build_mujoco_model(s, step, CONVEX).model for s in scenes]
         begun = time.perf_counter()
         roll_out(models, np.stack(starts), motor_torques(torque, begins, step))
         rate = ROLLOUTS / (time.perf_counter() - begun)
@@ -226,9 +226,9 @@ def rollouts(ensemble, torque) -> dict:
 
 def by_coulomb(ensemble, torque) -> dict:
     """Free bodies with Coulomb's friction, all processors: the rate at the longest step with right margins."""
-    from wholearm_jax.execution.mujoco_model import free_bodies
+    from wholearm_jax.execution.mujoco_model import build_mujoco_model
     from wholearm_jax.execution.rollout import clock, execute, motor_torques
-    from wholearm_jax.execution.trials import roll_out as driven
+    from wholearm_jax.execution.trials import rollout_in_parallel as driven
 
     prediction, scenes, starts = laid_in(ensemble, torque)
     steps = [step for step in STEPS if step >= FINEST]
@@ -237,7 +237,7 @@ def by_coulomb(ensemble, torque) -> dict:
     longest = min(wrong + 1, len(steps) - 1)
     wanted, error = steps[longest], errors[longest]
     begins, step = clock(ensemble.scene, wanted)
-    copies = [(free_bodies(s, step), start) for s, start in zip(scenes, starts, strict=True)]
+    copies = [(build_mujoco_model(s, step), start) for s, start in zip(scenes, starts, strict=True)]
     torques, workers = motor_torques(torque, begins, step), os.cpu_count() or 1
     list(driven(copies[:workers], torques[:10], workers))  # starts the processes
     begun = time.perf_counter()
@@ -331,7 +331,7 @@ def main() -> None:
     wa.configure(compiled=given.compiled or "well")
     jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are to be fresh
-    ensemble, file = vary(wa.load("heptagon"), VARIED, seed=1), HERE / "data" / "heptagon_knots.csv"
+    ensemble, file = make_ensemble(wa.load("heptagon"), VARIED, seed=1), HERE / "data" / "heptagon_knots.csv"
     torque = wa.read_torque(file)
     if given.compiled:
         print(json.dumps(first_and_rate(ensemble, torque)))

@@ -9,7 +9,7 @@ is a share `u` of `T`, place a share `p` of the wire's length `L`, and `w = dp/d
     maximise m   subject to   dp/du = w,   dw/du = (T^2/L) (A0 + A3 tau1 + A4 tau2) + T A2 w + L A1 w^2,
                               F0 + F1 (L w/T)^2 + F2 (L w/T) + F3 tau1 + F4 tau2 >= m,   |tau| <= limit,   w >= 0
 
-with `A` and `F` the coefficients of `wholearm_jax.dynamics.path_dynamics.Table`. States are cubics on each interval that satisfy the
+with `A` and `F` the coefficients of `wholearm_jax.dynamics.path_dynamics.PathDynamics`. States are cubics on each interval that satisfy the
 equation of motion at Radau's three points; forces count at these points and at the start. Each smooth piece of the
 wire enters as one Chebyshev series for every coefficient, refitted from the table to 1e-10, so that IPOPT sees smooth
 functions and exact second derivatives.
@@ -32,11 +32,11 @@ import numpy as np
 from scipy.special import beta, betainc
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import Table
-from wholearm_jax.margin.quasistatic import holds
-from wholearm_jax.model.schedule import padded
-from wholearm_jax.phases.phase import run
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.dynamics.path_dynamics import PathDynamics
+from wholearm_jax.margin.quasistatic import best_quasistatic_torque_batch
+from wholearm_jax.model.schedule import pad_schedule
+from wholearm_jax.phases.phase import simulate_phase
+from wholearm_jax.simulation.integrator import IntegratorOptions
 
 KNOTS, DEGREE = 31, 3
 FINE = 120  # collocation intervals of the best that is known
@@ -82,10 +82,10 @@ class Course(NamedTuple):
 class Collocated:
     """What IPOPT made of a phase.
 
-    `course.least` [N] is the least force at the collocation points, `ipopt` its status. `margin` [N] and `verdict` are
+    `course.plan_margin` [N] is the least force at the collocation points, `ipopt` its status. `margin` [N] and `verdict` are
     those of the honest simulation of `torque` (knots x 2, N m); `missed` is the distance to the wire's end that it
     leaves and `speed` the speed, in wire lengths and in these a duration. It took `solves` solves, `iterations` in all,
-    in `solve` seconds (the best of them alone in `best_solve`) after `build` seconds of building. Of the `guesses`
+    in `seconds` seconds (the best of them alone in `best_solve`) after `build` seconds of building. Of the `initial_guesses`
     tried one after the other only `spent` counts all, in seconds.
     """
 
@@ -118,7 +118,7 @@ class Collocated:
         return self.ipopt in CONVERGED and self.margin > 0 and self.missed < 1e-3 and self.speed < 0.05
 
 
-def collocate(table: Table, duration: float, *, knots: int = KNOTS) -> Collocated:
+def collocate(table: PathDynamics, duration: float, *, knots: int = KNOTS) -> Collocated:
     """Maximise a phase's margin by collocation, one interval between knots, from up to three first guesses.
 
     The minimum-jerk motion comes first, then the bell motion that can be squeezed hardest, then the even one; each
@@ -136,7 +136,7 @@ def collocate(table: Table, duration: float, *, knots: int = KNOTS) -> Collocate
     return replace(best, guesses=len(tried), spent=sum(one.build + one.solve for one in tried))
 
 
-def best_known(table: Table, duration: float, coarse: Collocated, *, enough: float = np.inf) -> Collocated:
+def best_known(table: PathDynamics, duration: float, coarse: Collocated, *, enough: float = np.inf) -> Collocated:
     """The largest margin that collocation finds with the same knots, whatever it costs, or one of `enough` newtons.
 
     Each interval between knots is divided, into `FINE` or more in all, so that forces are held at many times and the
@@ -159,7 +159,7 @@ def best_known(table: Table, duration: float, coarse: Collocated, *, enough: flo
 # --- the wire as smooth functions -------------------------------------------------------------------------------------
 
 
-def read(table: Table) -> Wire:
+def read(table: PathDynamics) -> Wire:
     """One Chebyshev series a piece, of the degree that reproduces the table's polynomials to `FIT`."""
     count = int(table.count)
     breaks = np.asarray(table.breaks)[: count + 1]
@@ -168,7 +168,7 @@ def read(table: Table) -> Wire:
     return Wire(tuple(pieces), float(table.length), np.asarray(table.torque_limit))
 
 
-def _series(table: Table, piece: int) -> np.ndarray:
+def _series(table: PathDynamics, piece: int) -> np.ndarray:
     first, panels = int(table.first[piece]), int(table.panels[piece])
     rows = slice(first, first + panels)
     force = np.asarray(table.force[rows])
@@ -225,7 +225,7 @@ class Part(NamedTuple):
 class Programme(NamedTuple):
     """IPOPT's solver for one phase, bounds of its variables and constraints, and how its variables are laid out.
 
-    Variables are torques, splits, states and the least force, in this order (`_pack`, `_unpack`); `times(splits)` are
+    Variables are torques, splits, states and the least force, in this order (`_pack`, `_unpack`); `fused_matmul(splits)` are
     the shares `u` of the states.
     """
 
@@ -279,7 +279,7 @@ def _parts(phase: Phase, rows: tuple[int, ...], splits: ca.MX) -> list[Part]:
 
 
 class Block(NamedTuple):
-    """One piece's equations: collocation `defects`, `forces` [N], shares `times`, what is positive to go `onward`."""
+    """One piece's equations: collocation `defects`, `forces` [N], shares `fused_matmul`, what is positive to go `onward`."""
 
     defects: ca.MX
     forces: ca.MX
@@ -369,8 +369,8 @@ def _bell(u: np.ndarray, p: int, q: int) -> tuple[np.ndarray, np.ndarray, np.nda
     return betainc(p + 1, q + 1, u), speed, speed * (p / inner - q / (1 - inner))
 
 
-def _squeezed(table: Table, duration: float, bell: tuple[int, int], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The best squeeze on a bell motion at shares `times`: torques [N m] and the least forces [N]."""
+def _squeezed(table: PathDynamics, duration: float, bell: tuple[int, int], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The best squeeze on a bell motion at shares `fused_matmul`: torques [N m] and the least forces [N]."""
     place, speed, pull = _bell(times, *bell)
     length = float(table.length)
     s = float(table.breaks[0]) + length * place
@@ -378,16 +378,16 @@ def _squeezed(table: Table, duration: float, bell: tuple[int, int], times: np.nd
     return np.asarray(held.torque), np.asarray(held.margin)
 
 
-_holds = jax.jit(holds)
+_holds = jax.jit(best_quasistatic_torque_batch)
 
 
-def _hardest(table: Table, duration: float) -> tuple[int, int]:
+def _hardest(table: PathDynamics, duration: float) -> tuple[int, int]:
     """The bell motion whose best squeeze has the largest least force."""
     times = np.linspace(0, 1, 241)
     return max(BELLS, key=lambda bell: _squeezed(table, duration, bell, times)[1].min())
 
 
-def _course(table: Table, phase: Phase, bell: tuple[int, int]) -> Course:
+def _course(table: PathDynamics, phase: Phase, bell: tuple[int, int]) -> Course:
     u = np.linspace(0, 1, 1501)
     tau, margin = _squeezed(table, phase.duration, bell, np.linspace(0, 1, phase.knots))
     place, speed, _ = _bell(u, *bell)
@@ -475,12 +475,12 @@ def _beside(phase: Phase, solve: Solve, step: np.ndarray) -> tuple[tuple[int, ..
     return tuple(moved.tolist()), np.where(step < 0, 0.98, np.where(step > 0, 0.02, solve.splits))
 
 
-def _collected(table: Table, phase: Phase, solves: list[Solve]) -> Collocated:
+def _collected(table: PathDynamics, phase: Phase, solves: list[Solve]) -> Collocated:
     """The best of several solves, simulated."""
     best = max(solves, key=lambda one: one.rank)
     torque = best.course.tau * phase.wire.limit
-    schedule = padded(wa.torque(np.linspace(0, phase.duration, phase.knots), torque))
-    outcome = run(table, schedule, jnp.zeros(()), jnp.asarray(phase.duration), Integration(), "rest")
+    schedule = pad_schedule(wa.torque(np.linspace(0, phase.duration, phase.knots), torque))
+    outcome = simulate_phase(table, schedule, jnp.zeros(()), jnp.asarray(phase.duration), IntegratorOptions(), "rest")
     last = int(outcome.motion.count)
     return Collocated(
         torque=torque,

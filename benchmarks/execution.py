@@ -15,7 +15,7 @@ import numpy as np
 from measure import RESULTS, save
 
 import wholearm_jax as wa
-from wholearm_jax.execution.mujoco_model import Softness
+from wholearm_jax.execution.mujoco_model import ContactCompliance
 from wholearm_jax.execution.rollout import execute
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
 
@@ -26,7 +26,7 @@ FINE, CONSTANTS = 5e-5, (1.5e-4, 3e-4, 6e-4, 1.2e-3, 2.4e-3, 4.8e-3)  # [s]
 STUDIES = {"timestep": "time step, $t_c$ three steps [ms]", "time_constant": "contacts' time constant $t_c$ [ms]"}
 
 
-def measure_one(prediction, timestep: float, softness: Softness) -> dict:
+def measure_one(prediction, timestep: float, softness: ContactCompliance) -> dict:
     """One execution: errors in metres and radians."""
     done = execute(prediction, timestep=timestep, softness=softness)
     times, expected = done.expected.time, done.expected.z
@@ -44,9 +44,9 @@ def study(prediction, *, quick: bool) -> dict[str, list[dict]]:
     steps, constants = (STEPS[1:4], CONSTANTS[2:5]) if quick else (STEPS, CONSTANTS)
     fine = 2e-4 if quick else FINE
     return {
-        "timestep": [{"at": h, **measure_one(prediction, h, Softness())} for h in steps],
+        "timestep": [{"at": h, **measure_one(prediction, h, ContactCompliance())} for h in steps],
         "time_constant": [
-            {"at": t, **measure_one(prediction, fine, Softness(time_constant=t / fine))} for t in constants
+            {"at": t, **measure_one(prediction, fine, ContactCompliance(time_constant=t / fine))} for t in constants
         ],
     }
 

@@ -19,8 +19,8 @@ from random_plans import _grasps, random_object, write
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.model.scene import Phase, formation, heading
-from wholearm_jax.planning.successors import Way, leaving, ways
+from wholearm_jax.model.scene import Phase, contact_formation, path_target
+from wholearm_jax.planning.successors import Successor, exit_velocity, successor_formations
 
 SHORTEST, LEAST_BOUND, SLOWED = 0.2, 0.2, 0.2  # wire [object radii], bound [N], speed after an impact over that before
 
@@ -58,21 +58,21 @@ def _from(grasp, shape, hand, phases):
         yield scene, chain
 
 
-def chains(scene: wa.Scene, z, depth: int, z_dot=None) -> Iterator[tuple[Way, ...]]:
+def chains(scene: wa.Scene, z, depth: int, z_dot=None) -> Iterator[tuple[Successor, ...]]:
     """Ways from `z` that lead on, each entered at the speed with which the one before it ends."""
-    for way in ways(scene, z, z_dot):
+    for way in successor_formations(scene, z, z_dot):
         holds = way.status is wa.Status.OK and way.bound > LEAST_BOUND and way.length > SHORTEST
         if not holds or (z_dot is not None and (way.pulls or way.speed < SLOWED)):
             continue
         if depth == 1:
             yield (way,)
         else:
-            yield from ((way, *rest) for rest in chains(scene, way.end, depth - 1, leaving(way.traced.table)))
+            yield from ((way, *rest) for rest in chains(scene, way.end, depth - 1, exit_velocity(way.traced.table)))
 
 
-def _phase(number: int, way: Way, duration: float, last: bool) -> Phase:
+def _phase(number: int, way: Successor, duration: float, last: bool) -> Phase:
     arrive = "rest" if last else "moving"
-    return Phase(f"phase {number}", formation(way.contacts), heading(way.toward), jnp.asarray(duration), arrive)
+    return Phase(f"phase {number}", contact_formation(way.contacts), path_target(way.toward), jnp.asarray(duration), arrive)
 
 
 def main() -> None:

@@ -26,9 +26,9 @@ import measure
 import numpy as np
 
 import wholearm_jax as wa
-from wholearm_jax.margin.contact_forces import score
-from wholearm_jax.model.schedule import Torque, padded, window
-from wholearm_jax.simulation.phase_motion import move
+from wholearm_jax.margin.contact_forces import minimum_margin
+from wholearm_jax.model.schedule import TorqueSchedule, pad_schedule, restrict_to_phase
+from wholearm_jax.simulation.phase_motion import simulate_motion
 
 HERE = Path(__file__).parent
 KNOTS = (4, 8, 16, 32, 64, 128)
@@ -40,19 +40,19 @@ WEAKER = 0.97  # share of the torques there: at the whole slide two contacts are
 SHOWN = {"forward": ("#0072B2", "o"), "reverse": ("#D55E00", "^"), "direct": ("#009E73", "s")}
 
 
-def given(phase: int, knots: int) -> Torque:
+def given(phase: int, knots: int) -> TorqueSchedule:
     """The phase's straight-line schedule, from its own start, at a number of knots."""
     line = wa.read_torque(HERE / "data" / "heptagon_ramps.csv")
     times, values = np.asarray(line.times), np.asarray(line.values)
     rows = np.flatnonzero((times >= phase) & (times <= phase + 1))[-2:] if phase else np.array([0, 1])
     share = np.linspace(0.0, 1.0, knots)[:, None]
-    return Torque(jnp.asarray(share[:, 0]), jnp.asarray(values[rows[0]] * (1 - share) + values[rows[1]] * share))
+    return TorqueSchedule(jnp.asarray(share[:, 0]), jnp.asarray(values[rows[0]] * (1 - share) + values[rows[1]] * share))
 
 
 def margin(values, times, table, duration, how: wa.Integration):
     """The margin of one phase."""
-    seen = window(padded(Torque(times, values)), jnp.zeros(()), duration)
-    return score(table, seen, duration, move(table, seen, duration, how=how), how).margin
+    seen = restrict_to_phase(pad_schedule(TorqueSchedule(times, values)), jnp.zeros(()), duration)
+    return minimum_margin(table, seen, duration, simulate_motion(table, seen, duration, how=how), how).margin
 
 
 def programs(times, values, table) -> dict[str, tuple]:
@@ -112,7 +112,7 @@ def differences(call, values) -> tuple[np.ndarray, float]:
 def accuracy(table, phase: int, tolerances, repeats: int) -> dict:
     """Gradient errors and times over tolerances."""
     torque = given(phase, CHECKED)
-    torque = Torque(torque.times, WEAKER * torque.values)
+    torque = TorqueSchedule(torque.times, WEAKER * torque.values)
     made = {name: call for name, (call, _) in programs(torque.times, torque.values, table).items()}
     true, doubt = differences(made["value"], torque.values)
     rows = []

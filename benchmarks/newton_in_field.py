@@ -21,11 +21,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from wholearm_jax.core.programs import Program
-from wholearm_jax.dynamics.path_dynamics import Table, balance, on_panel, powers
-from wholearm_jax.model.mechanics import System
-from wholearm_jax.model.schedule import Window, interval, torque_in
-from wholearm_jax.tracing.path import Wire
-from wholearm_jax.tracing.path_root import along_wire, newton
+from wholearm_jax.dynamics.path_dynamics import PathDynamics, equations_of_motion, evaluate, locate_panel
+from wholearm_jax.model.mechanics import ScaledMechanics
+from wholearm_jax.model.schedule import PhaseSchedule, interval, torque_at
+from wholearm_jax.tracing.path import ContactPath
+from wholearm_jax.tracing.path_root import path_derivatives, solve_on_path
 
 PLACES = 33  # known places of the wire: Newton's method starts within a sixty-fourth of its length
 
@@ -33,7 +33,7 @@ PLACES = 33  # known places of the wire: Newton's method starts within a sixty-f
 class Direct(eqx.Module):
     """What the direct way knows of a wire: its chart, signs, where its pieces end, and a few places to start from."""
 
-    system: System
+    system: ScaledMechanics
     chart: Float[Array, "5"]
     anchor: Float[Array, "5"]
     anchor_s: Float[Array, ""]
@@ -52,7 +52,7 @@ class Path(NamedTuple):
     count: Int[Array, "pieces"]
 
 
-def direct(system: System, wire: Wire, table: Table) -> Direct:
+def direct(system: ScaledMechanics, wire: ContactPath, table: PathDynamics) -> Direct:
     """The direct way's view of a wire of one chart."""
     pieces = int(table.count)
     if not np.all(np.asarray(wire.chart[:pieces]) == np.asarray(wire.chart[0])):
@@ -61,9 +61,9 @@ def direct(system: System, wire: Wire, table: Table) -> Direct:
 
     def place(s):
         piece = jnp.minimum((s >= wire.breaks[1:pieces]).sum(), pieces - 1)
-        panel, xi = powers(table, piece, s)
-        z = on_panel(table.configuration, panel, xi) / system.configuration_unit
-        return z, along_wire(system, z, wire.chart[0]).x
+        panel, xi = locate_panel(table, piece, s)
+        z = evaluate(table.configuration, panel, xi) / system.configuration_unit
+        return z, path_derivatives(system, z, wire.chart[0]).x
 
     z, x = jax.vmap(place)(s)
     signs = wire.slip_sign[:pieces], wire.joint_sign[:pieces]
@@ -78,9 +78,9 @@ def solve(way: Direct, piece, s, w, tau, duration):
     def above(system, z, x, height):
         return way.chart @ z - height
 
-    z = newton(above, way.system, way.z[near] + way.x[near] * (s - way.s[near]), way.chart, height).z
-    at = along_wire(way.system, z, way.chart)
-    matrix, right = balance(way.system, z, at.x, at.bend, way.slip_sign[piece], way.joint_sign[piece])
+    z = solve_on_path(above, way.system, way.z[near] + way.x[near] * (s - way.s[near]), way.chart, height).z
+    at = path_derivatives(way.system, z, way.chart)
+    matrix, right = equations_of_motion(way.system, z, at.x, at.bend, way.slip_sign[piece], way.joint_sign[piece])
     v = w / duration
     terms = jnp.concatenate([jnp.stack([jnp.ones_like(v), v**2, v]), tau / way.system.torque_unit])
     answer = jnp.linalg.solve(matrix, right @ terms)
@@ -88,7 +88,7 @@ def solve(way: Direct, piece, s, w, tau, duration):
 
 
 @Program
-def move(way: Direct, seen: Window, duration, solver: dfx.AbstractSolver, tolerance, max_steps: int) -> Path:
+def move(way: Direct, seen: PhaseSchedule, duration, solver: dfx.AbstractSolver, tolerance, max_steps: int) -> Path:
     """Move from rest at the wire's start to its end or to the end of time."""
     share, y = jnp.zeros(()), jnp.stack([way.breaks[0], jnp.zeros(())])
     steps, counts = [], []
@@ -107,19 +107,19 @@ def move(way: Direct, seen: Window, duration, solver: dfx.AbstractSolver, tolera
 
 
 @Program
-def moves(way: Direct, seen: Window, durations, solver: dfx.AbstractSolver, tolerance, max_steps: int) -> Path:
+def moves(way: Direct, seen: PhaseSchedule, durations, solver: dfx.AbstractSolver, tolerance, max_steps: int) -> Path:
     """One phase after the other, in one program."""
     return jax.lax.map(lambda duration: move(way, seen, duration, solver, tolerance, max_steps), durations)
 
 
 @Program
-def states(way: Direct, seen: Window, duration, path: Path):
+def states(way: Direct, seen: PhaseSchedule, duration, path: Path):
     """`z` and `z_dot` (SI) and `c_n` [N] at every step of a path."""
 
     def one(piece, row):
         share, s, w = row
         # A step that ends on a knot belongs to the interval before it; the torque is continuous.
-        tau = torque_in(seen, interval(seen, share), share)
+        tau = torque_at(seen, interval(seen, share), share)
         z, x, _, cn = solve(way, piece, s, w, tau, duration)
         unit = way.system.configuration_unit
         return z * unit, x * w / duration * unit, cn
@@ -130,7 +130,7 @@ def states(way: Direct, seen: Window, duration, path: Path):
 
 def _field(way, seen, duration, piece, row):
     def field(u, y, args):
-        tau = torque_in(seen, interval(seen, u) if row is None else row, u)
+        tau = torque_at(seen, interval(seen, u) if row is None else row, u)
         return jnp.stack([y[1], duration**2 * solve(way, piece, y[0], y[1], tau, duration)[2]])
 
     return dfx.ODETerm(field)

@@ -47,7 +47,7 @@ class Motion(NamedTuple):
 
 
 def arrays(table, seen) -> tuple[np.ndarray, ...]:
-    """A table and a torque window as the NumPy arrays that `move` wants."""
+    """A table and a torque window as the NumPy arrays that `simulate_motion` wants."""
     polynomials = np.ascontiguousarray(np.asarray(table.acceleration))
     whole = (np.asarray(a).astype(np.int64) for a in (table.first, table.panels))
     reals = (np.asarray(a) for a in (table.breaks, table.factor))
@@ -56,7 +56,7 @@ def arrays(table, seen) -> tuple[np.ndarray, ...]:
 
 
 def move(given, duration: float, method: Tableau, tolerance: float, max_steps: int = 4096) -> Motion:
-    """Simulate one phase from rest at the wire's start (`given` by `arrays`)."""
+    """Simulate one phase from rest at the wire's start (`as_strong_array` by `arrays`)."""
     nodes = np.empty((max_steps + 1, 3))
     count, evaluations = loop(given, duration, method, tolerance, nodes)
     return Motion(nodes, count, evaluations)

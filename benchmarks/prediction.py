@@ -47,15 +47,15 @@ from random_plans import plans as stopping_plans
 
 import wholearm_jax as wa
 from wholearm_jax.core.status import Status
-from wholearm_jax.ensembles.proportion import wilson
-from wholearm_jax.execution.mujoco_model import CONVEX, Softness
-from wholearm_jax.execution.rollout import Ending, Tolerance, execute, touching
+from wholearm_jax.ensembles.proportion import wilson_interval
+from wholearm_jax.execution.mujoco_model import CONVEX, ContactCompliance
+from wholearm_jax.execution.rollout import ExecutionOutcome, Tolerance, execute, touching_contacts_at
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.margin.quasistatic import coefficients
-from wholearm_jax.model.schedule import padded
-from wholearm_jax.phases.phase import destination
+from wholearm_jax.margin.quasistatic import affine_coefficients
+from wholearm_jax.model.schedule import pad_schedule
+from wholearm_jax.phases.phase import target_configuration
 from wholearm_jax.phases.result import Result
-from wholearm_jax.phases.sampling import sample
+from wholearm_jax.phases.sampling import sample_phase
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
 
 KNOTS, TIMESTEP = 51, 5e-5  # [s]
@@ -85,7 +85,7 @@ UNDECIDED = {Status.AMBIGUOUS, Status.SINGULAR, Status.NO_CONVERGENCE, Status.MA
 class Predicted(NamedTuple):
     """What the model says.
 
-    `holds` (None: left out), and the same if a force may not be tensile at any moment (`strict`); the least force and
+    `best_quasistatic_torque_batch` (None: left out), and the same if a force may not be tensile at any moment (`strict`); the least force and
     the mean force [N]; the longest time `dip` [s] for which a force is tensile while formations do not change, where
     the least force is (share of its phase), and how far from the planned end, over the tolerance, the object comes.
     """
@@ -103,7 +103,7 @@ class Predicted(NamedTuple):
 
 # --- predictions ------------------------------------------------------------------------------------------------------
 
-_coefficients = jax.jit(jax.vmap(coefficients, (None, 0)))
+_coefficients = jax.jit(jax.vmap(affine_coefficients, (None, 0)))
 
 
 def predict(scene: wa.Scene, torque: wa.Torque, traced) -> Predicted:
@@ -178,16 +178,16 @@ def _off(phase, course) -> float:
 
 def _apart(z, phase) -> float:
     """How far a configuration is from where a phase should end, over the tolerance."""
-    off = np.asarray(z - destination(phase, phase.traced))
+    off = np.asarray(z - target_configuration(phase, phase.traced))
     return float(max(np.hypot(*off[:2]) / TOLERANCE.position, abs(off[2]) / TOLERANCE.angle))
 
 
 def _course(result, phase):
-    """A phase at `PLACES` times until its motion ends, also beyond the loss of a contact."""
+    """A phase at `BOUND_PLACES` times until its motion ends, also beyond the loss of a contact."""
     outcome, motion = phase.outcome, phase.outcome.motion
     shares = jnp.linspace(0.0, motion.share[motion.count], PLACES)
-    schedule = padded(result.torque)
-    return jax.device_get(sample(phase.traced.table, schedule, outcome.start, outcome.duration, motion, shares))
+    schedule = pad_schedule(result.torque)
+    return jax.device_get(sample_phase(phase.traced.table, schedule, outcome.start, outcome.duration, motion, shares))
 
 
 def _arrives(phase, course, last: bool) -> bool | None:
@@ -285,10 +285,10 @@ def _squeeze(base: Predicted, chosen: int, rng: np.random.Generator) -> float | 
 # --- executions -------------------------------------------------------------------------------------------------------
 
 
-def executed(predicted: Predicted, timestep: float = TIMESTEP, softness: Softness = Softness()) -> dict:
+def executed(predicted: Predicted, timestep: float = TIMESTEP, softness: ContactCompliance = ContactCompliance()) -> dict:
     """One execution: whether it holds, where its phases end, and the longest time that a contact was open."""
     done = execute(predicted.result, timestep=timestep, softness=softness, tolerance=TOLERANCE)
-    closed = touching(predicted.result.scene, done.names, done.course.z, OPEN)
+    closed = touching_contacts_at(predicted.result.scene, done.names, done.course.z, OPEN)
     free, which, off = 0.0, None, 0.0
     for phase, course in zip(predicted.result.phases, predicted.courses, strict=True):
         judged = _judged(phase, course, done.course)
@@ -298,7 +298,7 @@ def executed(predicted: Predicted, timestep: float = TIMESTEP, softness: Softnes
                 free, which = longest, name
         if phase.arrive == "rest":
             off = max(off, _apart(_at(done.course, phase.start + float(phase.duration)), phase))
-    holds = done.ending is Ending.OK and free < FREE and off <= 1
+    holds = done.ending is ExecutionOutcome.OK and free < FREE and off <= 1
     errors = {"position_error": done.position_error, "angle_error": abs(done.angle_error), "off": off}
     found = {"holds": holds, "ending": done.ending.value, "free": free, "free_contact": which, **errors}
     found["creep"] = done.creep
@@ -469,7 +469,7 @@ def summarise(rows: list[dict]) -> dict:
 
     def rate(chosen):
         agreed = sum(row.get("agrees", "class" not in row) for row in chosen)
-        interval = wilson(agreed, len(chosen)) if chosen else (0.0, 1.0)
+        interval = wilson_interval(agreed, len(chosen)) if chosen else (0.0, 1.0)
         return {"agreed": agreed, "of": len(chosen), "rate": agreed / max(len(chosen), 1), "interval_95": interval}
 
     def is_clear(row):

@@ -19,7 +19,7 @@ import numpy as np
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.phases.phase import ending
+from wholearm_jax.phases.phase import describe_end
 
 VERTICES = (5, 9)  # least and most
 RADIUS = (0.034, 0.048)  # of the circle that the vertices lie in or near [m]
@@ -156,7 +156,7 @@ def _flipped(plan: dict[str, Any], end: str) -> dict[str, Any] | None:
 
 
 def _held_to(plan: dict[str, Any], coordinate: int, least: float) -> str | None:
-    """Why the last phase ends, if it can be followed and held over at least `least` of a coordinate; else None."""
+    """Why the last phase ends, if it can be followed and held over at least `plan_margin` of a coordinate; else None."""
     scene = wa.parse(plan)
     traced = wa.trace(scene)
     wire, table = traced[-1].wire, traced[-1].table
@@ -164,7 +164,7 @@ def _held_to(plan: dict[str, Any], coordinate: int, least: float) -> str | None:
         return None
     if not float(wa.bounds(scene, traced=traced)[-1].value) > LEAST_BOUND:
         return None
-    return ending(traced[-1], scene.phases[-1], scene.object.vertices.shape[0])
+    return describe_end(traced[-1], scene.phases[-1], scene.object.vertices.shape[0])
 
 
 def main() -> None:

@@ -19,15 +19,15 @@ import numpy as np
 from work_precision import problems
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import on_panel, powers
-from wholearm_jax.margin.contact_forces import force, score
-from wholearm_jax.model.scene import body
-from wholearm_jax.model.schedule import interval, torque_in
-from wholearm_jax.phases.phase import prepare
-from wholearm_jax.phases.sampling import SAMPLED, sample
-from wholearm_jax.simulation.event_step import acceleration
-from wholearm_jax.simulation.integrator import Stop, found
-from wholearm_jax.simulation.phase_motion import move
+from wholearm_jax.dynamics.path_dynamics import evaluate, locate_panel
+from wholearm_jax.margin.contact_forces import contact_force, minimum_margin
+from wholearm_jax.model.scene import rigid_body
+from wholearm_jax.model.schedule import interval, torque_at
+from wholearm_jax.phases.phase import trace_phase
+from wholearm_jax.phases.sampling import DEFAULT_SAMPLES, sample_phase
+from wholearm_jax.simulation.event_step import path_acceleration
+from wholearm_jax.simulation.integrator import TerminalEvent, integrate_adaptive
+from wholearm_jax.simulation.phase_motion import simulate_motion
 from wholearm_jax.tracing.path import Resolution
 
 COARSE = Resolution(6, 16, 8)
@@ -36,14 +36,14 @@ COARSE = Resolution(6, 16, 8)
 @partial(jax.jit, static_argnames="adjoint")
 def moved(table, seen, duration, adjoint="none"):
     """The motion alone."""
-    return move(table, seen, duration, how=wa.Integration(adjoint=adjoint))
+    return simulate_motion(table, seen, duration, how=wa.Integration(adjoint=adjoint))
 
 
 @jax.jit
 def scored(table, seen, duration):
     """The motion and its margin."""
     how = wa.Integration()
-    return score(table, seen, duration, move(table, seen, duration, how=how), how)
+    return minimum_margin(table, seen, duration, simulate_motion(table, seen, duration, how=how), how)
 
 
 @partial(jax.jit, static_argnames="stop")
@@ -51,17 +51,17 @@ def bare(table, seen, duration, stop=False):
     """One stage on the wire's first piece; `stop` looks for the first tensile force at every step's end."""
 
     def field(u, y, _):
-        tau = torque_in(seen, interval(seen, u), u)
+        tau = torque_at(seen, interval(seen, u), u)
         v = y[1] / duration
-        panel, xi = powers(table, 0, y[0])
+        panel, xi = locate_panel(table, 0, y[0])
         terms = jnp.stack([jnp.ones_like(v), v**2, v, *tau])
-        return jnp.stack([y[1], duration**2 * (on_panel(table.acceleration, panel, xi) * terms).sum()])
+        return jnp.stack([y[1], duration**2 * (evaluate(table.acceleration, panel, xi) * terms).sum()])
 
     def ended(t, y, args, **_):
         over = y[0] > table.breaks[1]
         if stop:
             row = interval(seen, t)
-            over = over | (force(table, seen, duration, 0, row, t, y[0], y[1]).min() < 0)
+            over = over | (contact_force(table, seen, duration, 0, row, t, y[0], y[1]).min() < 0)
         return over
 
     errors = dfx.PIDController(rtol=1e-10, atol=1e-10)
@@ -86,11 +86,11 @@ def stepped(table, seen, duration):
     """The same stage with all terms, by the package's own loop."""
 
     def field(u, y, row):
-        return jnp.stack([y[1], acceleration(table, seen, duration, 0, row, u, y[0], y[1])])
+        return jnp.stack([y[1], path_acceleration(table, seen, duration, 0, row, u, y[0], y[1])])
 
     y, final = jnp.stack([table.breaks[0], jnp.zeros(())]), jnp.ones(())
-    stop = Stop(lambda y: y[0] > table.breaks[1], lambda *_: jnp.asarray(False))  # as much is watched there
-    return found(field, seen, wa.Integration(), 0 * final, final, y, stop, final).y
+    stop = TerminalEvent(lambda y: y[0] > table.breaks[1], lambda *_: jnp.asarray(False))  # as much is watched there
+    return integrate_adaptive(field, seen, wa.Integration(), 0 * final, final, y, stop, final).y
 
 
 def rows(problem, repeats: int) -> list[dict]:
@@ -98,12 +98,12 @@ def rows(problem, repeats: int) -> list[dict]:
     table, seen, duration = problem.traced.table, problem.seen, problem.duration
     scene, phase = problem.scene, problem.scene.phases[problem.phase]
     rough = wa.trace(scene)[problem.phase - 1].end if problem.phase else scene.start
-    solid = body(scene.object)
+    solid = rigid_body(scene.object)
 
     def prepared(resolution):
-        return prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, resolution)
+        return trace_phase(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, resolution)
 
-    shares = np.linspace(0.0, 1.0, SAMPLED)
+    shares = np.linspace(0.0, 1.0, DEFAULT_SAMPLES)
     motion = moved(table, seen, duration)
     gradient = jax.jit(jax.value_and_grad(lambda v: _margin(table, seen, duration, v)))
     calls = {
@@ -113,7 +113,7 @@ def rows(problem, repeats: int) -> list[dict]:
         "the trajectory, when the margin is asked": (
             lambda: (
                 scored(table, seen, duration),
-                sample(table, problem.schedule, problem.start, duration, motion, shares),
+                sample_phase(table, problem.schedule, problem.start, duration, motion, shares),
             ),
             "margin",
         ),
@@ -141,7 +141,7 @@ def _margin(table, seen, duration, values):
     how = wa.Integration(adjoint="both")
     slope = jnp.diff(values, axis=0) / jnp.where(jnp.diff(seen.share) > 0, jnp.diff(seen.share), 1.0)[:, None]
     changed = eqx.tree_at(lambda w: (w.values, w.slope), seen, (values, slope))
-    return score(table, changed, duration, move(table, changed, duration, how=how), how).margin
+    return minimum_margin(table, changed, duration, simulate_motion(table, changed, duration, how=how), how).margin
 
 
 def main() -> None:

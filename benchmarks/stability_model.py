@@ -21,7 +21,7 @@ import numpy as np
 class Geometry(NamedTuple):
     """Contacts at configurations: gap, place along the feature, `G_n`, `G_t` and `G_n_dot z_dot`.
 
-    In the second row of a contact that rolls, `gap` is how far it has left its place, and `normal_rows` its `G_t`.
+    In the second row of a contact that rolls, `gap` is how far it has left its place, and `normal_jacobian` its `G_t`.
     """
 
     gap: np.ndarray

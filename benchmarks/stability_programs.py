@@ -14,17 +14,17 @@ import numpy as np
 from jaxtyping import Array, Float
 from stability_scenes import Scenes
 
-from wholearm_jax.dynamics.path_dynamics import Table, change, on_panel, powers, reduce_wire
-from wholearm_jax.margin.contact_forces import arcs, force, on_arc, score
-from wholearm_jax.margin.quasistatic import holds
-from wholearm_jax.model.mechanics import configuration_unit, system
-from wholearm_jax.model.scene import Formation, Hand, Heading, Polygon, body
-from wholearm_jax.model.schedule import Torque, torque_in, window
-from wholearm_jax.phases.assessment import GOALS, judge
-from wholearm_jax.simulation.event_step import acceleration
-from wholearm_jax.simulation.integrator import Integration
-from wholearm_jax.simulation.phase_motion import move
-from wholearm_jax.tracing.path import Resolution, Wire, trace_wire
+from wholearm_jax.dynamics.path_dynamics import PathDynamics, resolve_impact, evaluate, locate_panel, tabulate_path_dynamics
+from wholearm_jax.margin.contact_forces import dense_output, contact_force, evaluate_dense, minimum_margin
+from wholearm_jax.margin.quasistatic import best_quasistatic_torque_batch
+from wholearm_jax.model.mechanics import configuration_unit, scaled_mechanics
+from wholearm_jax.model.scene import ContactFormation, Hand, PathTarget, Polygon, rigid_body
+from wholearm_jax.model.schedule import TorqueSchedule, torque_at, restrict_to_phase
+from wholearm_jax.phases.assessment import GOALS, assess_phase
+from wholearm_jax.simulation.event_step import path_acceleration
+from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation.phase_motion import simulate_motion
+from wholearm_jax.tracing.path import Resolution, ContactPath, trace_path
 
 PLACES = np.concatenate([[0.0], (np.arange(30) + 0.5) / 30 + 0.01 * np.sin(np.arange(30.0)), [1.0]])
 TIMES = (np.arange(9) + 0.5) / 9
@@ -34,7 +34,7 @@ GAUSS = np.polynomial.legendre.leggauss(4)
 class Followed(NamedTuple):
     """What became of a scene's phase, and its tables read along the wire, at times, and within steps (SI units)."""
 
-    torque: Torque
+    torque: TorqueSchedule
     status: Float[Array, ""]
     moving_status: Float[Array, ""]
     margin: Float[Array, ""]
@@ -62,93 +62,93 @@ class Followed(NamedTuple):
 def mechanics(scene: Scenes):
     """The package's system and heading of one scene."""
     shape = Polygon(scene.vertices, scene.count, scene.mass, scene.friction)
-    solid = body(shape)
+    solid = rigid_body(shape)
     solid = eqx.tree_at(lambda b: b.inertia, solid, jnp.where(scene.uniform, solid.inertia, scene.inertia))
     hand = Hand(
         scene.joint, scene.length, scene.offset, scene.joint_inertia, scene.viscous, scene.dry, scene.torque_limit
     )
-    formation = Formation(scene.link, scene.kind, scene.feature, scene.tangential)
-    heading = Heading(scene.coordinate, scene.sign, scene.until_coordinate, scene.until_value)
-    return system(solid, hand, scene.gravity, formation), heading
+    formation = ContactFormation(scene.link, scene.kind, scene.feature, scene.tangential)
+    heading = PathTarget(scene.coordinate, scene.sign, scene.until_coordinate, scene.until_value)
+    return scaled_mechanics(solid, hand, scene.gravity, formation), heading
 
 
 def solid_vertices(scene: Scenes):
     """An object's vertices about its centre of mass."""
-    return body(Polygon(scene.vertices, scene.count, scene.mass, scene.friction)).vertices
+    return rigid_body(Polygon(scene.vertices, scene.count, scene.mass, scene.friction)).vertices
 
 
-def prepare(scene: Scenes, resolution: Resolution) -> tuple[Wire, Table]:
+def prepare(scene: Scenes, resolution: Resolution) -> tuple[ContactPath, PathDynamics]:
     """Trace and reduce one scene."""
     formation, heading = mechanics(scene)
-    wire = trace_wire(formation, scene.rough, heading, resolution)
-    return wire, reduce_wire(formation, wire)
+    wire = trace_path(formation, scene.rough, heading, resolution)
+    return wire, tabulate_path_dynamics(formation, wire)
 
 
-def drive(table: Table, scene: Scenes) -> Torque:
+def drive(table: PathDynamics, scene: Scenes) -> TorqueSchedule:
     """A schedule for one scene, by `torque_kind`: 0, the best squeeze for a steady acceleration that passes the wire in
     1 / `pace` of the duration, disturbed by `noise`; 1, random within the limits; 2, a thousand times that; 3, a
     millionth of it."""
     u = scene.pace * scene.knots
     one, rate, length = jnp.ones_like(u), scene.pace / scene.duration, table.length
     places = table.breaks[0] + length * jnp.minimum(u, 1.0) ** 2
-    squeezed = holds(table, places, 2 * length * u * rate, 2 * length * rate**2 * one).torque * (1 + scene.noise)
+    squeezed = best_quasistatic_torque_batch(table, places, 2 * length * u * rate, 2 * length * rate**2 * one).torque * (1 + scene.noise)
     random = scene.torque_limit * scene.noise
     kinds = [scene.torque_kind == k for k in range(3)]
     values = jnp.select(kinds, [squeezed, random, 1e3 * random], 1e-6 * random)
-    return Torque(scene.knots * scene.duration, jnp.where(jnp.isfinite(values), values, 0.0))
+    return TorqueSchedule(scene.knots * scene.duration, jnp.where(jnp.isfinite(values), values, 0.0))
 
 
-def follow(wire: Wire, table: Table, scene: Scenes, how: Integration) -> Followed:
+def follow(wire: ContactPath, table: PathDynamics, scene: Scenes, how: IntegratorOptions) -> Followed:
     """Simulate, score and judge one scene from rest, and read the results where the checks want them."""
     schedule = drive(table, scene)
-    seen = window(schedule, jnp.zeros_like(scene.duration), scene.duration)
-    motion = move(table, seen, scene.duration, how=how)
-    found = score(table, seen, scene.duration, motion, how)
-    entered = change(table, jnp.zeros_like(scene.rough))
-    verdict, moving = (judge(table, motion, found, goal, entered) for goal in (GOALS["rest"], GOALS["moving"]))
+    seen = restrict_to_phase(schedule, jnp.zeros_like(scene.duration), scene.duration)
+    motion = simulate_motion(table, seen, scene.duration, how=how)
+    found = minimum_margin(table, seen, scene.duration, motion, how)
+    entered = resolve_impact(table, jnp.zeros_like(scene.rough))
+    verdict, moving = (assess_phase(table, motion, found, goal, entered) for goal in (GOALS["rest"], GOALS["moving"]))
     end, s, w = (values[motion.count] for values in (motion.share, motion.s, motion.w))
-    steps = arcs(table, seen, scene.duration, motion)
+    steps = dense_output(table, seen, scene.duration, motion)
     unit = configuration_unit(jnp.sqrt((solid_vertices(scene) ** 2).sum(1).max()))
     last = jnp.maximum(motion.count - 1, 0)
     rest = jnp.where(motion.held[last] & (motion.count > 0), motion.share[last], end)
 
     def read(piece, s):
-        panel, xi = powers(table, piece, s)
+        panel, xi = locate_panel(table, piece, s)
 
         def velocity(s):
-            panel, xi = powers(table, piece, s)
-            return on_panel(table.velocity, panel, xi)
+            panel, xi = locate_panel(table, piece, s)
+            return evaluate(table.velocity, panel, xi)
 
         x, bend = jax.jvp(velocity, (s,), (jnp.ones_like(s),))
-        z = on_panel(table.configuration, panel, xi)
+        z = evaluate(table.configuration, panel, xi)
         return {"z": z, "x": x, "bend": bend, "slip": wire.slip_sign[piece], "joint": wire.joint_sign[piece]}
 
     def place(share):
         s = table.breaks[0] + table.length * share
         piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
-        panel, xi = powers(table, piece, s)
+        panel, xi = locate_panel(table, piece, s)
         tables = {
-            "acceleration": on_panel(table.acceleration, panel, xi),
-            "force": on_panel(table.force, panel, xi),
+            "acceleration": evaluate(table.acceleration, panel, xi),
+            "force": evaluate(table.force, panel, xi),
         }
         tables |= {"chart": wire.chart[piece]}
         return read(piece, s) | tables
 
     def state(step, xi):
         arc = jax.tree.map(lambda a: a[step], steps)
-        share, s, w = on_arc(arc, xi)
-        bend = acceleration(table, seen, scene.duration, arc.piece, arc.row, share, s, w)
+        share, s, w = evaluate_dense(arc, xi)
+        bend = path_acceleration(table, seen, scene.duration, arc.piece, arc.row, share, s, w)
         motion = {"v": w / scene.duration, "a": bend / scene.duration**2, "share": share}
-        pushed = force(table, seen, scene.duration, arc.piece, arc.row, share, s, w)
-        motion |= {"torque": torque_in(seen, arc.row, share), "force": pushed}
+        pushed = contact_force(table, seen, scene.duration, arc.piece, arc.row, share, s, w)
+        motion |= {"torque": torque_at(seen, arc.row, share), "force": pushed}
         motion |= {"parts": magnitudes(arc, share, s, motion["v"])}
         return read(arc.piece, s) | motion | {"held": arc.held | ~arc.live}
 
     def magnitudes(arc, share, s, v):
         """What each force is the sum of, in magnitude: against that its table is exact."""
-        panel, xi = powers(table, arc.piece, s)
-        terms = jnp.concatenate([jnp.stack([jnp.ones_like(v), v**2, v]), torque_in(seen, arc.row, share)])
-        return jnp.abs(on_panel(table.force, panel, xi)) @ jnp.abs(terms)
+        panel, xi = locate_panel(table, arc.piece, s)
+        terms = jnp.concatenate([jnp.stack([jnp.ones_like(v), v**2, v]), torque_at(seen, arc.row, share)])
+        return jnp.abs(evaluate(table.force, panel, xi)) @ jnp.abs(terms)
 
     def moment(share):
         step = jnp.clip((share >= motion.share).sum() - 1, 0, last)
@@ -207,13 +207,13 @@ def follow(wire: Wire, table: Table, scene: Scenes, how: Integration) -> Followe
 
 @cache
 def tracer(resolution: Resolution):
-    """`prepare` for a batch, compiled once."""
+    """`trace_phase` for a batch, compiled once."""
     return jax.jit(jax.vmap(lambda scene: prepare(scene, resolution)))
 
 
 @cache
-def follower(how: Integration):
-    """`follow` for a batch, compiled once."""
+def follower(how: IntegratorOptions):
+    """`trace_phase_path` for a batch, compiled once."""
     return jax.jit(jax.vmap(lambda wire, table, scene: follow(wire, table, scene, how)))
 
 
@@ -223,29 +223,29 @@ FLOATS = (
 )
 
 
-def margin(floats: dict, scene: Scenes, how: Integration):
+def margin(floats: dict, scene: Scenes, how: IntegratorOptions):
     """The margin of a scene as a function of its floats and the schedule's values (in `floats["torque"]`)."""
     scene = scene._replace(**{name: floats[name] for name in FLOATS})
     _, table = prepare(scene, Resolution())
-    schedule = Torque(jax.lax.stop_gradient(scene.knots * scene.duration), floats["torque"])
-    seen = window(schedule, jnp.zeros_like(scene.duration), scene.duration)
-    motion = move(table, seen, scene.duration, how=how)
-    return score(table, seen, scene.duration, motion, how).margin
+    schedule = TorqueSchedule(jax.lax.stop_gradient(scene.knots * scene.duration), floats["torque"])
+    seen = restrict_to_phase(schedule, jnp.zeros_like(scene.duration), scene.duration)
+    motion = simulate_motion(table, seen, scene.duration, how=how)
+    return minimum_margin(table, seen, scene.duration, motion, how).margin
 
 
 @cache
-def value(how: Integration):
+def value(how: IntegratorOptions):
     """The margins of a batch."""
     return jax.jit(jax.vmap(lambda floats, scene: margin(floats, scene, how)))
 
 
 @cache
-def forward(how: Integration):
+def forward(how: IntegratorOptions):
     """Margins of a batch and their derivatives along given directions, in forward mode."""
     return jax.jit(jax.vmap(lambda f, way, scene: jax.jvp(lambda f: margin(f, scene, how), (f,), (way,))))
 
 
 @cache
-def reverse(how: Integration):
+def reverse(how: IntegratorOptions):
     """The gradients of a batch, in reverse mode."""
     return jax.jit(jax.vmap(jax.grad(lambda floats, scene: margin(floats, scene, how))))

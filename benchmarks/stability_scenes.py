@@ -27,7 +27,7 @@ class Scenes(NamedTuple):
 
     `uniform` says that the inertia follows from a uniform density; `exact` that `rough` lies within `jitter` of a
     configuration in which all contacts touch. `family` is a row of `FAMILIES`. `torque_kind` and what follows describe
-    the torque (see `stability.drive`): `knots` are times as shares of the duration.
+    the torque (see `stability.run_schedule`): `knots` are times as shares of the duration.
     """
 
     vertices: np.ndarray

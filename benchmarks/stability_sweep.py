@@ -15,7 +15,7 @@ from stability_programs import FLOATS, GAUSS, follower, forward, reverse, tracer
 from stability_scenes import Scenes, draw
 
 from wholearm_jax.core.config import configure
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.integrator import IntegratorOptions
 from wholearm_jax.tracing.path import Resolution
 
 REASONS = (
@@ -244,7 +244,7 @@ def wedged(model, wires):
 def simulate(found, scenes, which, wires, tables, level, stepped, final, limits):
     """Simulate, check and record a batch; returns the rows that need more steps or a tighter tolerance."""
     rows, real = which
-    how = Integration(
+    how = IntegratorOptions(
         max_steps=level.steps, stages=max(8, level.steps // 128), tolerance=level.tolerance, steps=stepped
     )
     result = follower(how)(to_device(wires), to_device(tables), to_device(Scenes(*scenes[rows])))
@@ -353,7 +353,7 @@ def check_gradients(found, scenes, stepped, precision):
     level, limits = precision.levels[0], precision.limits
     good = (found["status"] == checks.OK) & found["moved"] & (found["level"] == 0) & (scenes.stepped == stepped)
     rows = np.flatnonzero(good)
-    how = Integration(max_steps=level.steps, stages=8, tolerance=level.tolerance, steps=stepped, adjoint="both")
+    how = IntegratorOptions(max_steps=level.steps, stages=8, tolerance=level.tolerance, steps=stepped, adjoint="both")
     for batch, real in batches(len(rows), DIFFERENTIATED):
         some = to_device(Scenes(*scenes[rows[batch]]))
         floats = {name: getattr(some, name) for name in FLOATS} | {"torque": to_device(found["torque"][rows[batch]])}

@@ -6,13 +6,13 @@ The heptagon's two phases, each under piecewise-linear torques (31 knots, as `op
 line in time, the smoothest that a schedule can hold. A run's error is the largest over its own steps, over `z`,
 `z_dot` and `c_n`, against the largest size of the places, the angles, their rates and each contact's force. The
 reference is SciPy's DOP853 at 1e-13 on all five coordinates, which shares nothing with the package. Both end before the
-object comes to rest, and times within `APART` of a slip reversal, where forces jump, do not count.
+object comes to rest, and times within `MIN_SEPARATION` of a slip reversal, where forces jump, do not count.
 
-Every time is that of one phase, warm, taken in turn. The package is timed as `move` alone, called from Python and, as a
+Every time is that of one phase, warm, taken in turn. The package is timed as `simulate_motion` alone, called from Python and, as a
 share of `MANY` phases that follow one another, within a program; as simulating and scoring (`run`); and with tracing
 and tabulating the wire included. Newton's method, too, is timed called from Python and within a program. All of JAX's
 programs, of both sides, are called as the package calls its own (`Program`) and compiled as `wholearm_jax.configure`
-says, and again in a second process as XLA does by itself (`PLAIN`). For each error level the ratio is between the
+says, and again in a second process as XLA does by itself (`PLAIN_TYPES`). For each error level the ratio is between the
 fastest runs that are at least as good.
 """
 
@@ -43,15 +43,15 @@ import numpy as np
 import wholearm_jax as wa
 from wholearm_jax.core.programs import Program
 from wholearm_jax.core.status import Status
-from wholearm_jax.dynamics.path_dynamics import Table
+from wholearm_jax.dynamics.path_dynamics import PathDynamics
 from wholearm_jax.files import scene_toml as scene_file
-from wholearm_jax.model.mechanics import system
-from wholearm_jax.model.scene import body
-from wholearm_jax.model.schedule import Torque, Window, padded, window
-from wholearm_jax.phases.phase import Traced, prepare, run
-from wholearm_jax.phases.sampling import sample
-from wholearm_jax.simulation.integrator import Integration
-from wholearm_jax.simulation.phase_motion import Motion, move
+from wholearm_jax.model.mechanics import scaled_mechanics
+from wholearm_jax.model.scene import rigid_body
+from wholearm_jax.model.schedule import TorqueSchedule, PhaseSchedule, pad_schedule, restrict_to_phase
+from wholearm_jax.phases.phase import TracedPhase, trace_phase, simulate_phase
+from wholearm_jax.phases.sampling import sample_phase
+from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation.phase_motion import Motion, simulate_motion
 
 HERE = Path(__file__).parent
 PLAIN = (
@@ -92,11 +92,11 @@ class Problem:
     name: str
     scene: wa.Scene
     phase: int
-    traced: Traced
-    schedule: Torque
+    traced: TracedPhase
+    schedule: TorqueSchedule
     start: jax.Array
     duration: jax.Array
-    seen: Window
+    seen: PhaseSchedule
     stop: float
     follow: Callable | None = None
     reference: Any = None
@@ -115,14 +115,14 @@ def problems(*, referred: bool) -> list[Problem]:
 def _problem(scene, traced, phase, kind, unreduced, referred) -> Problem:
     given = wa.read_torque(HERE / "data" / f"heptagon_{kind}.csv")
     start, duration = jnp.asarray(float(phase)), jnp.asarray(float(scene.phases[phase].duration))
-    schedule = padded(given)
-    outcome = run(traced[phase].table, schedule, start, duration, Integration(tolerance=1e-13), "moving")
+    schedule = pad_schedule(given)
+    outcome = simulate_phase(traced[phase].table, schedule, start, duration, IntegratorOptions(tolerance=1e-13), "moving")
     assert not bool(outcome.motion.held[0]), "the references do not wait"
     end = float(outcome.motion.share[int(outcome.motion.count)])
     stop = min(STOP.get(kind, 1.0), end)
 
     name = f"{scene.phases[phase].name}, {'31 knots' if kind == 'knots' else 'a straight line'}"
-    seen = jax.jit(window)(schedule, start, duration)
+    seen = jax.jit(restrict_to_phase)(schedule, start, duration)
     at = (name, scene, phase, traced[phase], schedule, start, duration, seen, stop)
     if not referred:
         return Problem(*at)
@@ -138,7 +138,7 @@ def _problem(scene, traced, phase, kind, unreduced, referred) -> Problem:
     return Problem(*at, follow, reference, scale)
 
 
-def _follow(model, z, toward, given: Torque, start: float, end: float, tolerance: float):
+def _follow(model, z, toward, given: TorqueSchedule, start: float, end: float, tolerance: float):
     """The un-reduced motion from rest at `z`; times are those since the phase's start."""
     times, values = np.asarray(given.times) - start, np.asarray(given.values)
     first = np.flatnonzero(times <= 0)[-1]
@@ -147,7 +147,7 @@ def _follow(model, z, toward, given: Torque, start: float, end: float, tolerance
 
 def system_of(scene: wa.Scene, phase: int):
     """A phase's mechanics in the object's units."""
-    return system(body(scene.object), scene.hand, scene.gravity, scene.phases[phase].formation)
+    return scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, scene.phases[phase].formation)
 
 
 def error(problem: Problem, shares, z, z_dot, cn) -> float:
@@ -177,20 +177,20 @@ class Call:
 
 
 @Program
-def _move(table: Table, seen: Window, duration, how: wa.Integration) -> Motion:
-    return move(table, seen, duration, how=how)
+def _move(table: PathDynamics, seen: PhaseSchedule, duration, how: wa.Integration) -> Motion:
+    return simulate_motion(table, seen, duration, how=how)
 
 
 @Program
-def _moves(table: Table, seen: Window, durations, how: wa.Integration) -> Motion:
+def _moves(table: PathDynamics, seen: PhaseSchedule, durations, how: wa.Integration) -> Motion:
     """One phase after the other."""
-    return jax.lax.map(lambda duration: move(table, seen, duration, how=how), durations)
+    return jax.lax.map(lambda duration: simulate_motion(table, seen, duration, how=how), durations)
 
 
 @Program
-def _at_steps(table: Table, schedule, start, duration, motion: Motion):
+def _at_steps(table: PathDynamics, schedule, start, duration, motion: Motion):
     """`z`, `z_dot`, `c_n` at the motion's steps."""
-    there = sample(table, schedule, start, duration, motion, motion.share)
+    there = sample_phase(table, schedule, start, duration, motion, motion.share)
     return there.z, there.z_dot, there.cn
 
 
@@ -208,18 +208,18 @@ def package(problem: Problem, solver: str, tolerance: float):
     count = int(motion.count)
     rows = (np.asarray(a)[: count + 1] for a in (motion.share, *_at_steps(table, *here, motion)))
     scene, phase = problem.scene, problem.scene.phases[problem.phase]
-    solid, rough = jax.jit(body)(scene.object), problem.traced.wire.start * problem.traced.wire.start.dtype.type(1)
+    solid, rough = jax.jit(rigid_body)(scene.object), problem.traced.wire.start * problem.traced.wire.start.dtype.type(1)
     rough = rough * system_of(scene, problem.phase).configuration_unit
 
     def again():
-        traced = prepare(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading)
-        return run(traced.table, *here, how, "moving")
+        traced = trace_phase(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading)
+        return simulate_phase(traced.table, *here, how, "moving")
 
     durations = _durations(problem, MANY)
     calls = {
         "package": Call(lambda: _move(table, problem.seen, problem.duration, how)),
         "package, within a program": Call(lambda: _moves(table, problem.seen, durations, how), MANY),
-        "package, run": Call(lambda: run(table, *here, how, "moving")),
+        "package, run": Call(lambda: simulate_phase(table, *here, how, "moving")),
         "package, trace and run": Call(again),
     }
     return error(problem, *rows), count, calls
@@ -238,7 +238,7 @@ def between(problem: Problem, tolerance: float) -> dict[str, float]:
     last = min(problem.stop, float(motion.share[int(motion.count)]))
     shares = jnp.linspace(0.0, last * (1 - 1e-12), 401)
     here = (problem.traced.table, problem.schedule, problem.start, problem.duration, motion)
-    there = sample(*here, shares)
+    there = sample_phase(*here, shares)
     wrong = error(problem, *(np.asarray(a) for a in (shares, there.z, there.z_dot, there.cn)))
     return {"tolerance": tolerance, "error": wrong}
 

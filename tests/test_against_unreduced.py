@@ -12,9 +12,9 @@ from scipy.optimize import brentq
 import wholearm_jax
 from wholearm_jax.files import scene_toml as scene_file
 from wholearm_jax.margin import quasistatic as squeeze
-from wholearm_jax.phases.phase import configuration, run, start_configuration
-from wholearm_jax.phases.sampling import sample
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.phases.phase import configuration, simulate_phase, start_configuration
+from wholearm_jax.phases.sampling import sample_phase
+from wholearm_jax.simulation.integrator import IntegratorOptions
 
 DURATION = 1.0
 
@@ -24,7 +24,7 @@ def passing(table, knots=9):
     u = 1.1 * jnp.linspace(0.0, 1.0, knots)  # aimed to arrive early
     length, rate = table.length, 1.1 / DURATION
     places = table.breaks[0] + length * jnp.minimum(u, 1.0) ** 2
-    held = squeeze.holds(table, places, 2 * length * u * rate, jnp.full(knots, 2 * length * rate**2))
+    held = squeeze.best_quasistatic_torque_batch(table, places, 2 * length * u * rate, jnp.full(knots, 2 * length * rate**2))
     return wholearm_jax.torque(np.linspace(0.0, DURATION, knots), held.torque)
 
 
@@ -63,14 +63,14 @@ def compared(name, phase, tolerance, samples):
     scene = SCENES[name]()
     table = wholearm_jax.trace(scene)[phase].table
     torque, start, length = passing(table), jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = run(table, torque, start, length, Integration(tolerance=tolerance), "moving").motion
+    motion = simulate_phase(table, torque, start, length, IntegratorOptions(tolerance=tolerance), "moving").motion
     steps = np.asarray(motion.share)[: int(motion.count) + 1]
     assert int(motion.status) == wholearm_jax.Status.LEFT_FORMATION
     assert 0.5 < steps[-1] < 1.0
 
     data = scene_file.to_dict(scene)
     model = unreduced.Model(data, data["phase"][phase]["contacts"])
-    begin = np.asarray(sample(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
+    begin = np.asarray(sample_phase(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
     assert np.abs(model.geometry(begin, np.zeros(5))[0]).max() < 1e-14
     times, values = np.asarray(torque.times), np.asarray(torque.values)
     followed = model.simulate(begin, data["phase"][phase]["toward"], times, values, steps[-1] * DURATION)
@@ -86,7 +86,7 @@ def compared(name, phase, tolerance, samples):
     shares = np.minimum(shares, steps[-1] * (1 - 1e-12))
     for time, _ in followed.reversals:
         shares = shares[np.abs(shares - time / DURATION) > 1e-9]
-    ours = sample(table, torque, start, length, motion, jnp.asarray(shares))
+    ours = sample_phase(table, torque, start, length, motion, jnp.asarray(shares))
     z, z_dot, cn = (np.array(column) for column in zip(*(followed.at(t) for t in shares * DURATION), strict=True))
     assert cn.min() > 0.3  # both see compression throughout, so that relative errors mean something
     errors = np.abs(ours.z - z).max(), np.abs(ours.z_dot - z_dot).max(), np.abs(np.asarray(ours.cn) / cn - 1).max()
@@ -122,12 +122,12 @@ def test_the_moment_of_a_loss(name, phase):
     table = wholearm_jax.trace(scene)[phase].table
     torque = passing(table)
     knot, middle = 3, table.breaks[0] + 0.15 * table.length
-    motion_by, _ = (np.asarray(terms) for terms in squeeze.coefficients(table, middle))
+    motion_by, _ = (np.asarray(terms) for terms in squeeze.affine_coefficients(table, middle))
     along = np.array([-motion_by[4], motion_by[3]]) / np.hypot(*motion_by[3:])  # torques that leave the motion alone
 
     def outcome(amount):
         weaker = wholearm_jax.Torque(torque.times, torque.values.at[knot].add(amount * along))
-        return weaker, run(table, weaker, 0.0, DURATION, Integration(tolerance=1e-12), "caught")
+        return weaker, simulate_phase(table, weaker, 0.0, DURATION, IntegratorOptions(tolerance=1e-12), "caught")
 
     weaker, found = max((outcome(amount) for amount in (-1.5, 1.5)), key=lambda one: np.isfinite(one[1].score.lost))
     assert int(found.motion.status) == wholearm_jax.Status.LEFT_FORMATION
@@ -176,11 +176,11 @@ def test_start_after_waiting(name, phase):
     scene = wholearm_jax.load(name)
     table = wholearm_jax.trace(scene)[phase].table
     later, delay = passing(table), 0.3
-    held = squeeze.hold(table, table.breaks[0], 0.0, -0.5 * table.length)  # slightly too weak to move
+    held = squeeze.best_quasistatic_torque(table, table.breaks[0], 0.0, -0.5 * table.length)  # slightly too weak to move
     times = np.concatenate([[0.0], delay + np.asarray(later.times)])
     values = np.concatenate([[held.torque], np.asarray(later.values)])
     torque, start, length = wholearm_jax.torque(times, values), jnp.asarray(0.0), jnp.asarray(times[-1])
-    motion = run(table, torque, start, length, Integration(tolerance=1e-12), "moving").motion
+    motion = simulate_phase(table, torque, start, length, IntegratorOptions(tolerance=1e-12), "moving").motion
     assert bool(motion.held[0])
     steps = np.asarray(motion.share)[: int(motion.count) + 1]
     assert np.all(np.diff(steps) >= 0)
@@ -189,7 +189,7 @@ def test_start_after_waiting(name, phase):
 
     data = scene_file.to_dict(scene)
     model = unreduced.Model(data, data["phase"][phase]["contacts"])
-    begin = np.asarray(sample(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
+    begin = np.asarray(sample_phase(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
     signs = np.sign(model.reversing(begin, model.direction(begin, data["phase"][phase]["toward"])))
     first = np.array([np.interp(departure, times, column) for column in values.T])
     # At departure the forward acceleration is zero by the other model too.
@@ -202,7 +202,7 @@ def test_start_after_waiting(name, phase):
     clock = np.linspace(departure + 0.01, departure + 0.95 * (end - departure), 40)
     z = np.array([followed.at(t)[0] for t in clock])
     assert np.ptp(z[:, 0]) > 0.02
-    ours = sample(table, torque, start, length, motion, jnp.asarray(clock / times[-1]))
+    ours = sample_phase(table, torque, start, length, motion, jnp.asarray(clock / times[-1]))
     error = np.abs(ours.z - z).max()
     print(f"{name}, phase {phase}: departs at {departure:.3f} s, largest error {error:.1e}")
     assert error < 1e-9
@@ -223,7 +223,7 @@ def test_which_way_an_object_at_rest_sets_out(name, phase):
     for _ in range(40):
         torque = rng.uniform(-1.0, 1.0, 2)
         ahead, behind = (model.solve(begin, still, torque, side * signs)[0] @ way for side in (1, -1))
-        motion = run(table, wholearm_jax.torque([0.0, 1.0], [torque] * 2), 0.0, 1.0, Integration(), "moving").motion
+        motion = simulate_phase(table, wholearm_jax.torque([0.0, 1.0], [torque] * 2), 0.0, 1.0, IntegratorOptions(), "moving").motion
         waits, status = bool(motion.held[0]), wholearm_jax.Status(int(motion.status))
         moves = int(motion.count) > 0 and not waits
         expected = (ahead > 0, behind < 0)

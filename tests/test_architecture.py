@@ -9,7 +9,7 @@ import numpy as np
 
 import wholearm_jax as wa
 from wholearm_jax.model.scene import polygon
-from wholearm_jax.phases.phase import _run, prepare
+from wholearm_jax.phases.phase import _simulate_phase, trace_phase
 
 PACKAGE = Path(wa.__file__).parent
 ORDER = (
@@ -93,7 +93,7 @@ def test_scenes_of_one_size_share_their_programs():
         scene = wa.load(name)
         with jax.log_compiles(False):
             wa.simulate(scene, wa.quasistatic(scene))
-        sizes = prepare.sizes(), _run.sizes()
+        sizes = trace_phase.sizes(), _simulate_phase.sizes()
         count(sizes)
     assert len(compiled) == 1, f"a later scene compiled again: {compiled}"
 

@@ -18,22 +18,22 @@ from wholearm_jax.ensembles import summary as survey_module
 from wholearm_jax.ensembles.batch import (
     ALONE,
     GOOD,
-    QUICK,
-    Checked,
+    COARSE_PASS,
+    BatchResult,
     _checks_of,
     _wires_of,
-    check_chunks,
+    check_in_chunks,
     check_scene,
     from_result,
 )
-from wholearm_jax.ensembles.ensemble import stack, vary
-from wholearm_jax.ensembles.summary import influences, survey
+from wholearm_jax.ensembles.ensemble import stack, make_ensemble
+from wholearm_jax.ensembles.summary import rank_correlations, summarise
 from wholearm_jax.files.check_store import StoreError, fingerprint, identity, open_store
 from wholearm_jax.files.polygons_npz import how_many, read_polygons
 from wholearm_jax.files.scene_toml import SceneError, to_dict
-from wholearm_jax.model.polygon import first_flaw
-from wholearm_jax.model.schedule import Torque, padded
-from wholearm_jax.phases.plan import steps_within, wires_together
+from wholearm_jax.model.polygon import find_defect
+from wholearm_jax.model.schedule import TorqueSchedule, pad_schedule
+from wholearm_jax.phases.plan import has_torque_jumps, trace_paths_in_one_program
 
 pytest.importorskip("zarr")
 ARRIVAL, SEED, COUNT = 0.02, 3, 6
@@ -51,7 +51,7 @@ def schedule(scene):
 
 @pytest.fixture(scope="module")
 def ensemble(scene):
-    return vary(scene, {"vertices": 0.0002, "friction": "10%"}, seed=SEED)
+    return make_ensemble(scene, {"vertices": 0.0002, "friction": "10%"}, seed=SEED)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_margins_are_right_to_what_is_said_by_default(ensemble, schedule, checke
 
 
 def test_scenes_with_the_same_wires_are_what_they_are_alone(scene, schedule):
-    loose = vary(scene, {"friction": "10%", "mass": "5%"}, seed=SEED)
+    loose = make_ensemble(scene, {"friction": "10%", "mass": "5%"}, seed=SEED)
     assert loose.same_wires
     checked = wa.check(loose, schedule, count=2, arrival=ARRIVAL, tolerance=1e-10)
     assert checked.margin[0] != checked.margin[1]
@@ -111,13 +111,13 @@ def test_a_scene_that_cannot_be_followed_disturbs_no_other(drawn, schedule, chec
 def test_what_follows_a_failure_must_be_known_as_well(scene, schedule):
     """Its margin counts: a table that is too coarse there is refined, though the status is that of the phase before."""
     bent = jnp.where((schedule.times < 0.5)[:, None], -schedule.values, schedule.values)
-    torque = padded(Torque(schedule.times, bent))
-    errors = [float(one.table.error) for one in wa.trace(scene, resolution=QUICK.resolution, tolerance=1.0)]
+    torque = pad_schedule(TorqueSchedule(schedule.times, bent))
+    errors = [float(one.table.error) for one in wa.trace(scene, resolution=COARSE_PASS.resolution, tolerance=1.0)]
     assert errors[0] < errors[1]
 
     @jax.jit
     def checked(limit):
-        return check_scene(scene, torque, ARRIVAL, QUICK._replace(error=limit))
+        return check_scene(scene, torque, ARRIVAL, COARSE_PASS._replace(error=limit))
 
     for limit, enough in ((np.sqrt(errors[0] * errors[1]), False), (2 * errors[1], True)):
         answer, grade = checked(limit)
@@ -127,7 +127,7 @@ def test_what_follows_a_failure_must_be_known_as_well(scene, schedule):
 
 
 def test_a_draw_depends_on_its_number_alone(scene, ensemble):
-    more = vary(scene, {"mass": "5%", "vertices": 0.0002, "friction": "10%"}, seed=SEED)
+    more = make_ensemble(scene, {"mass": "5%", "vertices": 0.0002, "friction": "10%"}, seed=SEED)
     one, other = ensemble.draw(7).object, more.draw(7).object
     assert np.array_equal(one.vertices, other.vertices)
     assert np.array_equal(one.friction, other.friction)
@@ -148,7 +148,7 @@ def test_polygons_of_different_size_stack(scene):
 def test_amounts_that_are_not_are_refused(scene):
     for bad in ({"colour": 1}, {"friction": "ten"}, {"friction": "-1%"}, {"inertia": "5%"}):
         with pytest.raises(ValueError, match=next(iter(bad))):
-            vary(scene, bad)
+            make_ensemble(scene, bad)
 
 
 def test_shares_and_amounts(scene):
@@ -156,7 +156,7 @@ def test_shares_and_amounts(scene):
     scene = eqx.tree_at(lambda s: s.object.inertia, scene, jnp.asarray(1e-4), is_leaf=lambda leaf: leaf is None)
     friction = jnp.array([0.1, 0.2, 0.4])
     scene = eqx.tree_at(lambda s: s.object.friction, scene, friction)
-    drawn = vary(scene, {"mass": "20%", "friction": "50%", "viscous": 0.005, "gravity": 0.2}, seed=SEED)
+    drawn = make_ensemble(scene, {"mass": "20%", "friction": "50%", "viscous": 0.005, "gravity": 0.2}, seed=SEED)
     many = jax.vmap(drawn.draw)(jnp.arange(2000))
 
     def spread(values, middle):
@@ -189,7 +189,7 @@ TOO_MUCH = {
 @pytest.mark.parametrize(("name", "amount", "cause"), [(name, *rest) for name, rest in TOO_MUCH.items()])
 def test_amounts_by_which_a_draw_may_be_no_scene(scene, name, amount, cause):
     with pytest.raises(ValueError, match=f"^{name}={amount}: too much, .*{cause}"):
-        vary(scene, {name: amount})
+        make_ensemble(scene, {name: amount})
 
 
 @pytest.mark.parametrize("amount", [0.004, 0.02, "15%", "60%"])
@@ -201,20 +201,20 @@ def test_polygons_that_are_drawn_are_polygons(scene, amount):
     width = size * (np.abs(value) if "%" in str(amount) else 1.0)
     drawn = value + width * rng.choice([-1.0, 1.0], (20_000, count, 2))
     try:
-        vary(scene, {"vertices": amount})
+        make_ensemble(scene, {"vertices": amount})
     except ValueError:
-        assert first_flaw(drawn) is not None
+        assert find_defect(drawn) is not None
     else:
-        assert first_flaw(drawn) is None
+        assert find_defect(drawn) is None
 
 
 def test_the_survey_counts_and_ranks(scene, checked):
-    told = survey(scene, [checked], COUNT)
+    told = summarise(scene, [checked], COUNT)
     assert told.holds + sum(told.failures.values()) == COUNT
     assert told.holds == int((checked.status == 0).sum())
     x = np.random.default_rng(0).uniform(-1, 1, (500, 3))
     x[:, 2] = 0
-    found = influences(3 * x[:, 1] + 0.1 * x[:, 0], x)
+    found = rank_correlations(3 * x[:, 1] + 0.1 * x[:, 0], x)
     assert found[1] > 0.95
     assert abs(found[0]) < 0.3
     assert found[2] == 0
@@ -233,9 +233,9 @@ def test_the_survey_says_what_fails_where(scene, monkeypatch):
         (lost, -0.2, 2, 1),
     ]
     status, margin, contact, phase = (np.array(column) for column in zip(*rows, strict=True))
-    whole = Checked(status, margin, np.zeros(7), contact, phase, np.zeros((7, 5)))
-    parts = [Checked(*(column[part] for column in whole)) for part in (slice(0, 4), slice(4, 7))]
-    told = survey(scene, parts, 7)
+    whole = BatchResult(status, margin, np.zeros(7), contact, phase, np.zeros((7, 5)))
+    parts = [BatchResult(*(column[part] for column in whole)) for part in (slice(0, 4), slice(4, 7))]
+    told = summarise(scene, parts, 7)
     third, fourth = scene.phases[1].formation.names[2], scene.phases[0].formation.names[3]
     assert told.holds == 2
     assert told.failures == {
@@ -257,7 +257,7 @@ def test_the_survey_says_what_fails_where(scene, monkeypatch):
     np.testing.assert_array_equal(told.numbers, np.arange(7))
     np.testing.assert_array_equal(told.margins, margin)
     monkeypatch.setattr(survey_module, "SAMPLE", 3)
-    few = survey(scene, parts, 7)
+    few = summarise(scene, parts, 7)
     np.testing.assert_array_equal(few.numbers, [0, 3, 6])
     np.testing.assert_array_equal(few.margins, margin[[0, 3, 6]])
     assert few.failures == told.failures
@@ -287,7 +287,7 @@ def test_a_store_left_half_made_is_made_again_and_a_half_written_chunk_is_not_do
     zarr.create_group(str(path)).create_array("margin", shape=(4,), dtype="float64")  # killed before it said what it is
     store = open_store(path, wanted)
     assert store.chunks == 2
-    ones = Checked(*(np.ones((2, *shape)) for shape in ((), (), (), (), (), (5,))))._asdict()
+    ones = BatchResult(*(np.ones((2, *shape)) for shape in ((), (), (), (), (), (5,))))._asdict()
     with pytest.raises(ValueError, match="could not convert"):
         store.write(0, ones | {"end": np.full((2, 5), "not a number")})
     assert store.done().tolist() == [False, False]
@@ -310,7 +310,7 @@ def test_a_store_goes_on_and_ends_the_same(tmp_path, ensemble, schedule):
     """Chunk by chunk, in another order, over a chunk left half written: bit for bit the same."""
     wanted = identity(COUNT, 2, seed=SEED)
     whole, broken = (open_store(tmp_path / name, wanted) for name in ("whole", "broken"))
-    found = dict(check_chunks(ensemble, schedule, COUNT, chunk=2, arrival=ARRIVAL))
+    found = dict(check_in_chunks(ensemble, schedule, COUNT, chunk=2, arrival=ARRIVAL))
     for number, part in found.items():
         whole.write(number, part._asdict())
     broken.write(1, found[1]._asdict())
@@ -318,7 +318,7 @@ def test_a_store_goes_on_and_ends_the_same(tmp_path, ensemble, schedule):
     again = open_store(tmp_path / "broken", wanted)
     missing = [k for k in range(again.chunks) if not again.done()[k]]
     assert missing == [0, 2]
-    for number, part in check_chunks(ensemble, schedule, COUNT, chunk=2, arrival=ARRIVAL, wanted=missing[::-1]):
+    for number, part in check_in_chunks(ensemble, schedule, COUNT, chunk=2, arrival=ARRIVAL, wanted=missing[::-1]):
         again.write(number, part._asdict())
     for number in range(3):
         for one, other in zip(whole.read(number), again.read(number), strict=True):
@@ -411,10 +411,10 @@ def test_mass_and_inertia_vary_in_any_order(scene):
     heavy = eqx.tree_at(lambda s: s.object.inertia, scene, jnp.asarray(2e-4), is_leaf=lambda leaf: leaf is None)
     amounts = {"mass": "20%", "inertia": "10%"}
     one, other = (
-        vary(heavy, dict(order), seed=SEED).draw(4).object for order in (amounts.items(), [*amounts.items()][::-1])
+        make_ensemble(heavy, dict(order), seed=SEED).draw(4).object for order in (amounts.items(), [*amounts.items()][::-1])
     )
     assert float(one.inertia) == float(other.inertia)
-    alone = vary(heavy, {"inertia": "10%"}, seed=SEED).draw(4).object
+    alone = make_ensemble(heavy, {"inertia": "10%"}, seed=SEED).draw(4).object
     assert float(one.inertia) == pytest.approx(float(alone.inertia * one.mass / scene.object.mass), rel=1e-12)
 
 
@@ -433,8 +433,8 @@ def test_an_object_waits_only_where_some_forces_hold_it(scene, schedule, ways):
     alone = wa.simulate(scene, torque, arrival=ARRIVAL)
     assert alone.phases[0].holds[0].start == 0.0, "it waits"
     assert (alone.phases[0].holds[0].lost is None) is held
-    step = QUICK._replace(how=replace(QUICK.how, steps=True))
-    _, grade = jax.jit(lambda: check_scene(scene, padded(torque), ARRIVAL, step))()
+    step = COARSE_PASS._replace(how=replace(COARSE_PASS.how, steps=True))
+    _, grade = jax.jit(lambda: check_scene(scene, pad_schedule(torque), ARRIVAL, step))()
     assert int(grade) == (GOOD if held else ALONE)
     assert_as_alone(wa.check([scene], torque, arrival=ARRIVAL, tolerance=1e-10), scene, torque, 0)
 
@@ -447,17 +447,17 @@ def test_scenes_that_share_their_geometry_share_their_wires(scene):
         changed = scene
         for at, value in zip(where, (friction, mass), strict=True):
             changed = eqx.tree_at(at, changed, value)
-        return wires_together(changed, QUICK.resolution)
+        return trace_paths_in_one_program(changed, COARSE_PASS.resolution)
 
     frictions, masses = jnp.full((2, 3), 0.1) * jnp.array([[1.0], [1.5]]), jnp.array([0.2, 0.3])
     shared = jax.eval_shape(jax.vmap(wires, out_axes=None), frictions, masses)
-    assert shared.breaks.shape == (len(scene.phases), QUICK.resolution.pieces + 1)
+    assert shared.breaks.shape == (len(scene.phases), COARSE_PASS.resolution.pieces + 1)
 
 
 def test_scenes_side_by_side_as_on_a_gpu_are_what_they_are_one_after_the_other(ensemble, schedule):
-    numbers, level = jnp.arange(3), QUICK._replace(how=replace(QUICK.how, steps=steps_within(ensemble.scene, schedule)))
+    numbers, level = jnp.arange(3), COARSE_PASS._replace(how=replace(COARSE_PASS.how, steps=has_torque_jumps(ensemble.scene, schedule)))
     wires = _wires_of((ensemble, level.resolution, True), numbers)
-    found, grade = _checks_of((ensemble, padded(schedule), ARRIVAL, level, True), numbers, wires)
+    found, grade = _checks_of((ensemble, pad_schedule(schedule), ARRIVAL, level, True), numbers, wires)
     assert grade.tolist() == [GOOD] * len(numbers)
     one_by_one = wa.check(ensemble, schedule, count=len(numbers), arrival=ARRIVAL)
     for each, other in zip(found, one_by_one, strict=True):

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from wholearm_jax.ensembles.batch import Checked
+from wholearm_jax.ensembles.batch import BatchResult
 from wholearm_jax.files.check_store import TYPES, StoreError, identity, open_store
 
 zarr = pytest.importorskip("zarr")
@@ -113,7 +113,7 @@ def test_several_processes_leave_what_one_does(command, whole, tmp_path, number)
 def test_a_full_disk_is_an_error_and_what_is_there_stays(tmp_path, monkeypatch):
     wanted = identity(4, 2, seed=1)
     store = open_store(tmp_path / "full.zarr", wanted)
-    ones = Checked(*(np.ones((2, *shape)) for shape in ((), (), (), (), (), (5,))))
+    ones = BatchResult(*(np.ones((2, *shape)) for shape in ((), (), (), (), (), (5,))))
     store.write(0, ones._asdict())
 
     async def full(*_, **__):

@@ -31,11 +31,11 @@ def test_random_plans_can_be_followed_and_held():
 def test_random_plans_at_speed_lead_on():
     from flying_plans import chains
 
-    from wholearm_jax.planning.successors import leaving
+    from wholearm_jax.planning.successors import exit_velocity
 
     scene = wa.load("flight")
     traced = wa.trace(scene)
-    onward = list(chains(scene, traced[0].end, 1, leaving(traced[0].table)))
+    onward = list(chains(scene, traced[0].end, 1, exit_velocity(traced[0].table)))
     assert all(way.status is wa.Status.OK and way.bound > 0 for (way,) in onward)
     for (way,) in onward:
         np.testing.assert_allclose(way.traced.begin, traced[0].end, atol=1e-9)

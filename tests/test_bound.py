@@ -11,9 +11,9 @@ from scipy.optimize import linprog
 
 import wholearm_jax as wa
 from wholearm_jax.margin import quasistatic as squeeze
-from wholearm_jax.margin.quasistatic import FASTEST, PLACES, SPEEDS
+from wholearm_jax.margin.quasistatic import MAX_SPEED_RATIO, BOUND_PLACES, BOUND_SPEEDS
 
-coefficients, bound, hold = jax.jit(squeeze.coefficients), jax.jit(squeeze.bound), jax.jit(squeeze.hold)
+coefficients, bound, hold = jax.jit(squeeze.affine_coefficients), jax.jit(squeeze.margin_upper_bound), jax.jit(squeeze.best_quasistatic_torque)
 
 
 def largest_least_force(offset, slope, limits, forward=None):
@@ -36,7 +36,7 @@ def best_at(table, duration, place, rests):
     if sign is not None:
         still = largest_least_force(force[:, 0], force[:, 3:], limits, (sign * motion[3:], sign * motion[0]))
         return still, still
-    speeds = FASTEST * float(table.length) / duration * np.linspace(0.0, 1.0, SPEEDS + 1) ** 2
+    speeds = MAX_SPEED_RATIO * float(table.length) / duration * np.linspace(0.0, 1.0, BOUND_SPEEDS + 1) ** 2
 
     def at(square, linear):
         return largest_least_force(force[:, 0] + square + linear, force[:, 3:], limits)
@@ -62,7 +62,7 @@ def test_the_bound_is_the_least_of_the_best_forces(phase, duration, rests, limit
     assert value == pytest.approx(most, rel=1e-9)
     assert value >= true - 1e-9
     assert float(top.s) == pytest.approx(float(table.breaks[0] + tight * table.length), rel=1e-12)
-    for place in (0.0, *(np.random.default_rng(0).choice(np.arange(1, PLACES), 6) / PLACES), 1.0):
+    for place in (0.0, *(np.random.default_rng(0).choice(np.arange(1, BOUND_PLACES), 6) / BOUND_PLACES), 1.0):
         assert best_at(table, duration, float(place), rests)[1] >= value - 1e-9
 
 

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import change, on_panel, powers
-from wholearm_jax.model.contact_kinematics import normal_rows, slip_rows
-from wholearm_jax.model.mechanics import system
-from wholearm_jax.model.scene import body
-from wholearm_jax.model.scene import heading as wa_heading
-from wholearm_jax.optimisation.optimiser import PASSING
+from wholearm_jax.dynamics.path_dynamics import resolve_impact, evaluate, locate_panel
+from wholearm_jax.model.contact_kinematics import normal_jacobian, tangential_jacobian
+from wholearm_jax.model.mechanics import scaled_mechanics
+from wholearm_jax.model.scene import rigid_body
+from wholearm_jax.model.scene import path_target as wa_heading
+from wholearm_jax.optimisation.optimiser import MIN_TRANSITION_SPEED
 from wholearm_jax.phases import plan
 from wholearm_jax.phases.phase import start_configuration
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.integrator import IntegratorOptions
 
 FLIGHTS = ("flight", "passage")
 
@@ -32,7 +32,7 @@ def test_three_formations_without_a_stop(flown):
     for before, after in zip(result.phases[:-1], result.phases[1:], strict=True):
         assert after.start == pytest.approx(before.time, abs=1e-12), "the change is when the formation ends"
         mean = float(after.traced.table.length) / float(after.duration)
-        assert float(after.outcome.entered.speed) > (PASSING - 1e-6) * mean, "at speed"
+        assert float(after.outcome.entered.speed) > (MIN_TRANSITION_SPEED - 1e-6) * mean, "at speed"
         assert min(after.impulses) > 0
     times, values = np.asarray(flown.torque.times), np.asarray(flown.torque.values)
     assert np.abs(np.diff(values, axis=0)[np.diff(times) == 0]).max() < 1e-9, "a step there would be on a knife's edge"
@@ -58,23 +58,23 @@ def test_momentum_balances_and_energy_falls_across_every_change(flown):
     scene = flown.scene
     for before, after in zip(flown.result.phases[:-1], flown.result.phases[1:], strict=True):
         formation = scene.phases[flown.result.phases.index(after)].formation
-        mechanics = system(body(scene.object), scene.hand, scene.gravity, formation)
+        mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, formation)
         z_dot, table = before.outcome.leaving, after.traced.table
-        entered = change(table, z_dot)
+        entered = resolve_impact(table, z_dot)
         unit = mechanics.configuration_unit
         z = start_configuration(table) / unit
-        panel, xi = powers(table, jnp.asarray(0), table.breaks[0])
-        moving = on_panel(table.velocity, panel, xi) * entered.speed / unit
-        sliding = jnp.sign(slip_rows(mechanics.contacts, z) @ moving)
-        wrench = normal_rows(mechanics.contacts, z)
-        wrench = wrench - (mechanics.contacts.friction * sliding)[:, None] * slip_rows(mechanics.contacts, z)
+        panel, xi = locate_panel(table, jnp.asarray(0), table.breaks[0])
+        moving = evaluate(table.velocity, panel, xi) * entered.speed / unit
+        sliding = jnp.sign(tangential_jacobian(mechanics.contacts, z) @ moving)
+        wrench = normal_jacobian(mechanics.contacts, z)
+        wrench = wrench - (mechanics.contacts.friction * sliding)[:, None] * tangential_jacobian(mechanics.contacts, z)
         gained = mechanics.inertia * (moving - z_dot / unit)
         given = wrench.T @ (entered.impulse / mechanics.force_unit)
         scale = float(jnp.abs(mechanics.inertia * z_dot / unit).max())
         np.testing.assert_allclose(gained, given, atol=1e-12 * scale)
         energy = [float((mechanics.inertia * v**2).sum()) for v in (z_dot / unit, moving)]
         assert energy[1] <= energy[0] * (1 + 1e-12)
-        assert float(jnp.abs(normal_rows(mechanics.contacts, z) @ moving).max()) < 1e-12 * float(jnp.abs(moving).max())
+        assert float(jnp.abs(normal_jacobian(mechanics.contacts, z) @ moving).max()) < 1e-12 * float(jnp.abs(moving).max())
 
 
 def test_derivatives_pass_through_the_changes(flown):
@@ -88,11 +88,11 @@ def test_derivatives_pass_through_the_changes(flown):
     way = jnp.asarray(rng.normal(size=base.shape)) * 0.05
 
     def how(adjoint):  # a change that comes early leaves two rows of one time within the next phase
-        return Integration(tolerance=1e-13, max_steps=512, steps=plan.steps_within(scene, torque), adjoint=adjoint)
+        return IntegratorOptions(tolerance=1e-13, max_steps=512, steps=plan.has_torque_jumps(scene, torque), adjoint=adjoint)
 
     def end(amount, adjoint="none"):
         schedule = wa.Torque(torque.times, base + amount * way)
-        found = plan.outcomes(scene, schedule, traced, how(adjoint))
+        found = plan.simulate_phases(scene, schedule, traced, how(adjoint))
         second = found[1]
         return jnp.stack([second.start, second.entered.speed, second.score.margin, *second.entered.impulse])
 

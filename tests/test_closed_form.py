@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import wholearm_jax
-from wholearm_jax.dynamics.path_dynamics import on_panel, powers
+from wholearm_jax.dynamics.path_dynamics import evaluate, locate_panel
 from wholearm_jax.margin import quasistatic as squeeze
 
 W, H, X, MASS, GRAVITY = 0.03, 0.06, 0.08, 0.2, 9.81
@@ -93,8 +93,8 @@ def slide(request):
 
     def configuration(s):
         piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
-        panel, xi = powers(table, piece, s)
-        return on_panel(table.configuration, panel, xi)
+        panel, xi = locate_panel(table, piece, s)
+        return evaluate(table.configuration, panel, xi)
 
     return request.param, traced, s, np.asarray(jax.jit(jax.vmap(configuration))(s))
 
@@ -111,9 +111,9 @@ def test_wire(slide):
 
 
 def test_holding_forces(slide):
-    """Torques of `hold` at rest: in balance, and their least force is that of the paper solution."""
+    """Torques of `best_quasistatic_torque` at rest: in balance, and their least force is that of the paper solution."""
     joints, traced, s, z = slide
-    held = squeeze.holds(traced.table, s, jnp.zeros_like(s), jnp.zeros_like(s))
+    held = squeeze.best_quasistatic_torque_batch(traced.table, s, jnp.zeros_like(s), jnp.zeros_like(s))
     for x, torque, margin in zip(z[:, 0], np.asarray(held.torque), np.asarray(held.margin), strict=True):
         x_ddot, _, _, forces = by_hand(x, 0.0, torque, joints)
         assert abs(x_ddot) < 1e-9
@@ -130,7 +130,7 @@ def test_moving(slide, speed, torque):
     """Acceleration and all four forces for given torques at rest and in motion."""
     joints, traced, s, z = slide
     table, wire = traced.table, traced.wire
-    acceleration, force = (np.asarray(a) for a in jax.vmap(squeeze.coefficients, (None, 0))(table, s))
+    acceleration, force = (np.asarray(a) for a in jax.vmap(squeeze.affine_coefficients, (None, 0))(table, s))
     unit = 1 / np.hypot(W, H / 2)  # s is a coordinate of z in the object's own unit of length
     pieces = np.minimum((np.asarray(s)[:, None] >= np.asarray(table.breaks)[1:-1]).sum(1), int(table.count) - 1)
     for x, piece, a_row, f_rows in zip(z[:, 0], pieces, acceleration, force, strict=True):

@@ -7,18 +7,18 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.model.contact_kinematics import (
-    along_rates,
-    constraint_curvature,
-    constraint_rates,
-    constraint_rows,
+    feature_velocity,
+    constraint_second_derivative,
+    constraint_velocity,
+    constraint_jacobian,
     constraints,
-    frames,
-    gap_rates,
-    slip_rows,
-    slips,
+    contact_kinematics,
+    gap_velocity,
+    tangential_jacobian,
+    slip_velocity,
 )
-from wholearm_jax.model.mechanics import system
-from wholearm_jax.model.scene import body
+from wholearm_jax.model.mechanics import scaled_mechanics
+from wholearm_jax.model.scene import rigid_body
 
 NEAR = {"rtol": 1e-13, "atol": 1e-13}
 
@@ -27,7 +27,7 @@ NEAR = {"rtol": 1e-13, "atol": 1e-13}
 def mechanics(request):
     """A formation that slides, and one with a contact that rolls; its candidates are all groups of features."""
     scene = wa.load(request.param)
-    return system(body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)
+    return scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)
 
 
 def anywhere(seed):
@@ -42,7 +42,7 @@ def test_a_body_turns_by_its_angle(mechanics, angle):
     vertex = np.stack(mechanics.candidates.point)
 
     def at(z):
-        return frames(mechanics.candidates, z).from_object
+        return contact_kinematics(mechanics.candidates, z).from_object
 
     turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ vertex
     on = np.asarray(mechanics.candidates.on_link)
@@ -55,17 +55,17 @@ def test_a_body_turns_by_its_angle(mechanics, angle):
 def test_rates_are_derivatives_of_gaps_and_places(mechanics, seed):
     z, x = anywhere(seed)
     for several in (mechanics.contacts, mechanics.candidates):
-        _, (gap, along) = jax.jvp(lambda z, s=several: (frames(s, z).gap, frames(s, z).along), (z,), (x,))
-        np.testing.assert_allclose(gap_rates(several, z, x), gap, **NEAR)
-        np.testing.assert_allclose(along_rates(several, z, x), along, **NEAR)
+        _, (gap, along) = jax.jvp(lambda z, s=several: (contact_kinematics(s, z).gap, contact_kinematics(s, z).along), (z,), (x,))
+        np.testing.assert_allclose(gap_velocity(several, z, x), gap, **NEAR)
+        np.testing.assert_allclose(feature_velocity(several, z, x), along, **NEAR)
 
 
 @pytest.mark.parametrize("seed", [2, 3])
 def test_what_leaves_out_the_rows_is_their_product(mechanics, seed):
     z, x = anywhere(seed)
     several = mechanics.contacts
-    np.testing.assert_allclose(constraint_rates(several, z, x), constraint_rows(several, z) @ x, **NEAR)
-    np.testing.assert_allclose(slips(several, z, x), several.slides * (slip_rows(several, z) @ x), **NEAR)
+    np.testing.assert_allclose(constraint_velocity(several, z, x), constraint_jacobian(several, z) @ x, **NEAR)
+    np.testing.assert_allclose(slip_velocity(several, z, x), several.slides * (tangential_jacobian(several, z) @ x), **NEAR)
 
 
 @pytest.mark.parametrize("seed", [4, 5])
@@ -77,4 +77,4 @@ def test_curvature_of_all_that_may_meet(mechanics, seed):
             return jax.jvp(lambda z: constraints(several, z), (z,), (x,))[1]
 
         _, curvature = jax.jvp(slope, (z,), (x,))
-        np.testing.assert_allclose(constraint_curvature(several, z, x), curvature, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(constraint_second_derivative(several, z, x), curvature, rtol=1e-12, atol=1e-12)

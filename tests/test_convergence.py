@@ -12,11 +12,11 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.core.status import Status
-from wholearm_jax.dynamics.path_dynamics import blank
-from wholearm_jax.ensembles.ensemble import vary
-from wholearm_jax.model.schedule import padded, window
-from wholearm_jax.simulation.integrator import Integration
-from wholearm_jax.simulation.phase_motion import move
+from wholearm_jax.dynamics.path_dynamics import placeholder_dynamics
+from wholearm_jax.ensembles.ensemble import make_ensemble
+from wholearm_jax.model.schedule import pad_schedule, restrict_to_phase
+from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation.phase_motion import simulate_motion
 from wholearm_jax.tracing.path import Resolution
 
 LOOSE = 1e6  # a tolerance that accepts every step: steps are what lies between knots
@@ -34,7 +34,7 @@ def table():
     pieces = np.stack([uneven, -uneven])
     pieces[0, 0] += [5.0, -0.6, -0.4, 1.5, -0.8]
     pieces[1, 0] += [-2.0, 0.5, 0.3, 0.4, -0.2]
-    empty = blank(Resolution(pieces=2, panels=2, nodes=8))
+    empty = placeholder_dynamics(Resolution(pieces=2, panels=2, nodes=8))
     given = ([0.0, 0.6, 1.0], 2, [0, 1], [1, 1], pieces)
     return eqx.tree_at(
         lambda t: (t.breaks, t.count, t.first, t.panels, t.acceleration), empty, tuple(map(jnp.asarray, given))
@@ -44,9 +44,9 @@ def table():
 @cache
 def program(solver):
     """A simulation of the phase in given steps, compiled for schedules of one padded length."""
-    how = Integration(solver=solver, tolerance=LOOSE, max_steps=320, stages=3)
+    how = IntegratorOptions(solver=solver, tolerance=LOOSE, max_steps=320, stages=3)
     wire, start, duration = table(), jnp.zeros(()), jnp.ones(())
-    return jax.jit(lambda schedule: move(wire, window(schedule, start, duration), duration, how=how))
+    return jax.jit(lambda schedule: simulate_motion(wire, restrict_to_phase(schedule, start, duration), duration, how=how))
 
 
 def history(solver, parts):
@@ -54,7 +54,7 @@ def history(solver, parts):
     in each interval of the torque."""
     times = np.linspace(0.0, 1.0, 4 * parts + 1)
     values = np.stack([np.interp(times, KNOTS, column) for column in TORQUE.T], axis=1)
-    found = program(solver)(padded(wa.torque(times, values), 320))
+    found = program(solver)(pad_schedule(wa.torque(times, values), 320))
     count = int(found.count)
     assert int(found.status) == Status.LEFT_FORMATION
     assert set(np.asarray(found.piece)[:count].tolist()) == {0, 1}
@@ -78,7 +78,7 @@ def test_an_object_that_rests_within_a_step_is_stopped_and_set_out_again():
     """At 0.27 of the second phase it comes to rest for an eightieth, less than a step of most tolerances: the speed at
     steps' ends shows nothing, and carried on the object would slide back with the friction of forward travel."""
     varied = {"vertices": 0.0006, "friction": "60%", "mass": "20%"}
-    scene = vary(wa.load("heptagon"), varied, seed=1).draw(1107)
+    scene = make_ensemble(wa.load("heptagon"), varied, seed=1).draw(1107)
     schedule = wa.read_torque(Path(__file__).parent.parent / "benchmarks" / "data" / "heptagon_knots.csv")
     traced = wa.trace(scene)
     margins = []

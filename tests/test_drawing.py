@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wholearm_jax.files.scene_toml import load, parse, to_dict
-from wholearm_jax.model.schedule import torque
+from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan import simulate
 from wholearm_jax.plotting.palette import CONTACT_COLOURS, DASHES, contact_styles
 from wholearm_jax.plotting.plan_figures import (
@@ -27,7 +27,7 @@ def pushed():
     """The heptagon pushed to the left under constant torques."""
     data = to_dict(load("heptagon"))
     data["phase"] = [data["phase"][0] | {"arrive": "caught", "duration": 0.3}]
-    return simulate(parse(data), torque([0.0, 0.3], [[0.55, -0.24]] * 2))
+    return simulate(parse(data), torque_schedule([0.0, 0.3], [[0.55, -0.24]] * 2))
 
 
 @pytest.fixture(autouse=True)

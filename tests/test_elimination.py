@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wholearm_jax.core.small_linalg import crossed, inverse, solve
+from wholearm_jax.core.small_linalg import null_vector, inverse_and_determinant, solve
 
 
 @pytest.mark.parametrize("n", [1, 4, 5])
 def test_inverse_and_determinant(n):
     matrices = np.random.default_rng(0).normal(size=(200, n, n))
     matrices[0] = np.eye(n)[::-1]  # nothing but exchanges of rows
-    inverted, determinants = jax.vmap(inverse)(matrices)
+    inverted, determinants = jax.vmap(inverse_and_determinant)(matrices)
     condition = np.linalg.cond(matrices)[:, None, None]
     exact = np.linalg.inv(matrices)
     assert np.all(np.abs(inverted - exact) <= 1e-14 * condition * np.abs(exact).max((1, 2), keepdims=True))
@@ -31,7 +31,7 @@ def test_derivatives_in_both_modes():
     matrix, way = rng.normal(size=(2, 5, 5))
 
     def along(t):
-        inverted, determinant = inverse(matrix + t * way)
+        inverted, determinant = inverse_and_determinant(matrix + t * way)
         return jnp.append(inverted.ravel(), determinant)
 
     forward, reverse = jax.jacfwd(along)(0.0), jax.jacrev(along)(0.0)
@@ -42,7 +42,7 @@ def test_derivatives_in_both_modes():
 
 
 def test_a_singular_matrix_shows():
-    inverted, determinant = inverse(jnp.zeros((5, 5)).at[0, 0].set(1.0))
+    inverted, determinant = inverse_and_determinant(jnp.zeros((5, 5)).at[0, 0].set(1.0))
     assert determinant == 0
     assert not np.all(np.isfinite(inverted))
 
@@ -50,7 +50,7 @@ def test_a_singular_matrix_shows():
 def test_what_is_orthogonal_to_four_rows():
     rng = np.random.default_rng(3)
     rows, other = rng.normal(size=(200, 4, 5)), rng.normal(size=(200, 5))
-    across = jax.vmap(crossed)(rows)
+    across = jax.vmap(null_vector)(rows)
     np.testing.assert_allclose(jnp.einsum("nij,nj->ni", rows, across), 0.0, atol=1e-13)
     whole = np.concatenate([rows, other[:, None]], axis=1)
     np.testing.assert_allclose((across * other).sum(1), np.linalg.det(whole), rtol=1e-10, atol=1e-13)
@@ -59,4 +59,4 @@ def test_what_is_orthogonal_to_four_rows():
 def test_nothing_is_across_rows_that_depend_on_one_another():
     rows = np.random.default_rng(4).normal(size=(4, 5))
     rows[3] = rows[0] - 2 * rows[1] + rows[2]
-    np.testing.assert_allclose(crossed(jnp.asarray(rows)), 0.0, atol=1e-14)
+    np.testing.assert_allclose(null_vector(jnp.asarray(rows)), 0.0, atol=1e-14)

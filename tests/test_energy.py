@@ -6,11 +6,11 @@ import pytest
 from test_against_unreduced import DURATION, passing
 
 import wholearm_jax
-from wholearm_jax.model.contact_kinematics import contacts, slip_rows
-from wholearm_jax.model.scene import body
-from wholearm_jax.phases.phase import run
-from wholearm_jax.phases.sampling import sample
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.model.contact_kinematics import contact_set, tangential_jacobian
+from wholearm_jax.model.scene import rigid_body
+from wholearm_jax.phases.phase import simulate_phase
+from wholearm_jax.phases.sampling import sample_phase
+from wholearm_jax.simulation.integrator import IntegratorOptions
 
 NODES = 8  # Gauss-Legendre points a step
 
@@ -20,19 +20,19 @@ NODES = 8  # Gauss-Legendre points a step
 def test_balance(name, phase):
     """Powers integrated over every step of a passage of the wire against the change of energy."""
     scene = wholearm_jax.load(name)
-    solid, hand = body(scene.object), scene.hand
-    several = contacts(solid, hand, scene.phases[phase].formation)
+    solid, hand = rigid_body(scene.object), scene.hand
+    several = contact_set(solid, hand, scene.phases[phase].formation)
     table = wholearm_jax.trace(scene)[phase].table
     torque, start, length = passing(table), jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = run(table, torque, start, length, Integration(tolerance=1e-13, max_steps=512), "moving").motion
+    motion = simulate_phase(table, torque, start, length, IntegratorOptions(tolerance=1e-13, max_steps=512), "moving").motion
     ends = np.asarray(motion.share)[: int(motion.count) + 1]
     x, weight = np.polynomial.legendre.leggauss(NODES)
     low, high = ends[:-1, None], ends[1:, None]
     shares = (low + high) / 2 + (high - low) / 2 * x
     weights = ((high - low) / 2 * weight).ravel() * DURATION
-    at = sample(table, torque, start, length, motion, jnp.asarray(shares.ravel()))
+    at = sample_phase(table, torque, start, length, motion, jnp.asarray(shares.ravel()))
     z, z_dot = np.asarray(at.z), np.asarray(at.z_dot)
-    slip = np.stack([np.asarray(slip_rows(several, q)) @ rate for q, rate in zip(z, z_dot, strict=True)])
+    slip = np.stack([np.asarray(tangential_jacobian(several, q)) @ rate for q, rate in zip(z, z_dot, strict=True)])
     joint = z_dot[:, 3:]
     work = {
         "torques": (np.asarray(at.torque) * joint).sum(1) @ weights,
@@ -43,7 +43,7 @@ def test_balance(name, phase):
     inertia = np.array([solid.mass, solid.mass, solid.inertia, *hand.inertia], float)
 
     def energy(share):
-        last = sample(table, torque, start, length, motion, jnp.asarray([share]))
+        last = sample_phase(table, torque, start, length, motion, jnp.asarray([share]))
         kinetic = (inertia * np.asarray(last.z_dot)[0] ** 2).sum() / 2
         return kinetic - float(solid.mass) * np.asarray(scene.gravity) @ np.asarray(last.z)[0, :2], kinetic
 

@@ -18,24 +18,24 @@ from scipy.stats import binomtest
 
 import wholearm_jax as wa
 from wholearm_jax.execution import rollout as execution
-from wholearm_jax.execution.mujoco_model import CONVEX, Softness, _wedges, free_bodies
+from wholearm_jax.execution.mujoco_model import CONVEX, ContactCompliance, _wedges, build_mujoco_model
 from wholearm_jax.execution.rollout import (
-    Ending,
+    ExecutionOutcome,
     Tolerance,
     clock,
-    drive,
+    run_schedule,
     execute,
-    judge,
+    assess_execution,
     motor_torques,
     start_of,
     stepper,
     target_of,
 )
-from wholearm_jax.execution.trials import Amounts, _perturbed, _summary, perturb, start_near, wilson
+from wholearm_jax.execution.trials import Amounts, _perturbed, _summary, run_trials, start_near, wilson
 from wholearm_jax.files.results import _perturbed_row, write_execution
-from wholearm_jax.model.contact_kinematics import contacts, frames, normal_rows
-from wholearm_jax.model.mechanics import system
-from wholearm_jax.model.scene import body, formation, parse_contact
+from wholearm_jax.model.contact_kinematics import contact_set, contact_kinematics, normal_jacobian
+from wholearm_jax.model.mechanics import scaled_mechanics
+from wholearm_jax.model.scene import rigid_body, contact_formation, parse_contact
 from wholearm_jax.plotting.execution_figures import animate, draw_execution, draw_execution_strip
 
 DATA = Path(__file__).parent / "data"
@@ -60,10 +60,10 @@ def executions(predictions):
 def test_distances_are_the_c_functions(name, predictions):
     """MuJoCo's distance of each pair equals its gap where one faces the other, to the rounding of its 32-bit meshes."""
     scene, rng = wa.load(name), np.random.default_rng(0)
-    bodies = free_bodies(scene, 2e-4)
+    bodies = build_mujoco_model(scene, 2e-4)
     data = mujoco.MjData(bodies.model)
-    several = contacts(body(scene.object), scene.hand, formation(bodies.names))
-    locate, checked = jax.jit(frames), set()
+    several = contact_set(rigid_body(scene.object), scene.hand, contact_formation(bodies.names))
+    locate, checked = jax.jit(contact_kinematics), set()
     for _ in range(100):
         data.qpos[:] = start_of(predictions[name]) + rng.uniform(-1, 1, 5) * [0.04, 0.04, 3.0, 0.5, 0.5]
         mujoco.mj_kinematics(bodies.model, data)
@@ -91,7 +91,7 @@ def test_free_fall_and_free_fingers(predictions):
     """Away from everything the object falls by g t^2 / 2 and a finger obeys J theta'' = tau - B theta' - D."""
     scene, step, count = predictions["heptagon"].scene, 1e-4, 1000
     start, torque = np.array([0.0, 1.0, 0.3, 1.0, 2.0]), np.array([0.2, -0.3])
-    course, creep = drive(free_bodies(scene, step), scene, start, np.tile(torque, (count, 1)), step)
+    course, creep = run_schedule(build_mujoco_model(scene, step), scene, start, np.tile(torque, (count, 1)), step)
     assert creep == 0.0
     t = count * step
     np.testing.assert_allclose(course.z[-1, :3], [0, 1 - 9.81 * t * (t + step) / 2, 0.3], rtol=1e-12, atol=1e-12)
@@ -108,7 +108,7 @@ def test_every_link_and_joint_has_its_own_friction(predictions):
     scene = eqx.tree_at(
         lambda s: (s.object.friction, s.hand.dry, s.hand.viscous), scene, tuple(map(jnp.asarray, (mu, dry, viscous)))
     )
-    bodies = free_bodies(scene, 1e-4)
+    bodies = build_mujoco_model(scene, 1e-4)
     assert bodies.model.npair == len(bodies.names)
     for name in bodies.names:
         assert list(bodies.model.pair(name).friction[:2]) == [mu[parse_contact(name)[0]]] * 2
@@ -117,9 +117,9 @@ def test_every_link_and_joint_has_its_own_friction(predictions):
         assert bodies.model.joint(joint).damping[0] == expected
 
 
-def thrown(scene, z, z_dot, step, count, softness=Softness()):
+def thrown(scene, z, z_dot, step, count, softness=ContactCompliance()):
     """Where an object is, and how fast, after so many steps with idle fingers out of the way."""
-    bodies = free_bodies(scene, step, softness)
+    bodies = build_mujoco_model(scene, step, softness)
     data, forces, advance = mujoco.MjData(bodies.model), np.zeros((len(bodies.names), 2)), stepper(bodies)
     data.qpos[:], data.qvel[:] = [*z, 0.1, np.pi - 0.1], [*z_dot, 0.0, 0.0]
     for _ in range(count):
@@ -130,7 +130,7 @@ def thrown(scene, z, z_dot, step, count, softness=Softness()):
 def lying(scene, turned):
     """A pose in which the lowest vertices of the object touch the palm, and the lowest from its centre."""
     c, s = np.cos(turned), np.sin(turned)
-    arms = np.asarray(body(scene.object).vertices) @ np.array([[c, s], [-s, c]])
+    arms = np.asarray(rigid_body(scene.object).vertices) @ np.array([[c, s], [-s, c]])
     lowest = arms[np.argmin(arms[:, 1])]
     return np.array([0.0, -lowest[1], turned]), lowest
 
@@ -138,7 +138,7 @@ def lying(scene, turned):
 def test_an_object_that_slides_on_the_palm_stops_and_stays(predictions):
     """From a speed v it slides by v^2 / (2 mu g), and then rests, as precisely as its contacts are hard."""
     scene, speed, step = predictions["heptagon"].scene, 0.2, 1e-4
-    first, second = np.asarray(body(scene.object).vertices)[:2]
+    first, second = np.asarray(rigid_body(scene.object).vertices)[:2]
     flat = -np.arctan2(*(second - first)[::-1])
     deceleration = 9.81 * float(np.asarray(scene.object.friction)[0])
     (z, _), rests = lying(scene, flat), speed / deceleration
@@ -159,7 +159,7 @@ def test_a_vertex_that_hits_the_palm_obeys_newton_and_coulomb(turned, speed, pre
     """
     scene = eqx.tree_at(lambda s: s.gravity, predictions["heptagon"].scene, jnp.zeros(2))
     scene = eqx.tree_at(lambda s: s.object.friction, scene, jnp.full(3, 0.3))
-    solid, (z, arm) = body(scene.object), lying(scene, turned)
+    solid, (z, arm) = rigid_body(scene.object), lying(scene, turned)
     m, i = float(solid.mass), float(solid.inertia)
     tangential = -0.3 * np.sign(speed)
     away = np.array([tangential / m, 1 / m, (arm[0] - tangential * arm[1]) / i])  # what an impulse P_n = 1 does
@@ -171,7 +171,7 @@ def test_a_vertex_that_hits_the_palm_obeys_newton_and_coulomb(turned, speed, pre
         found = thrown(scene, z, (speed, -0.2, 0.0), 1e-6, 500, replace(softness, time_constant=50.0))[1][:3]
         return np.abs((found - expected) * [1, 1, np.hypot(*arm)]).max()
 
-    assert off(Softness()) < 2e-3
+    assert off(ContactCompliance()) < 2e-3
     assert off(CONVEX) > 0.01
 
 
@@ -179,9 +179,9 @@ def test_a_vertex_that_hits_the_palm_obeys_newton_and_coulomb(turned, speed, pre
 def test_contact_forces_and_weight_change_the_momentum(name, executions):
     """Newton's second law and its moment, step by step, from the traces of all contacts."""
     course, scene = executions[name].course, executions[name].prediction.scene
-    solid = body(scene.object)
-    several = contacts(solid, scene.hand, formation(executions[name].names))
-    at = jax.vmap(frames, (None, 0))(several, course.z)
+    solid = rigid_body(scene.object)
+    several = contact_set(solid, scene.hand, contact_formation(executions[name].names))
+    at = jax.vmap(contact_kinematics, (None, 0))(several, course.z)
     n = np.stack(at.normal, axis=-1)
     force = course.cn[..., None] * n + course.ct[..., None] * np.stack([n[..., 1], -n[..., 0]], axis=-1)
     arm = np.stack(at.from_object, axis=-1)
@@ -199,7 +199,7 @@ def test_contact_forces_and_weight_change_the_momentum(name, executions):
 @pytest.mark.parametrize("name", NAMES)
 def test_ends_where_predicted(name, executions):
     done = executions[name]
-    assert done.ending is Ending.OK
+    assert done.ending is ExecutionOutcome.OK
     assert done.timestep == pytest.approx(2e-4, rel=1e-12)
     assert done.position_error < 3e-5
     assert abs(done.angle_error) < 1e-4
@@ -258,7 +258,7 @@ def test_a_plan_predicted_to_fail_fails(predictions):
     torque = predictions["heptagon"].torque
     weak = wa.simulate(predictions["heptagon"].scene, eqx.tree_at(lambda t: t.values, torque, 0.1 * torque.values))
     assert weak.status.label != "ok"
-    assert execute(weak, timestep=5e-4).ending is not Ending.OK
+    assert execute(weak, timestep=5e-4).ending is not ExecutionOutcome.OK
 
 
 def test_a_plan_of_one_step():
@@ -274,7 +274,7 @@ def test_a_plan_of_one_step():
 def test_perturbed_executions_repeat_with_the_seed(predictions):
     few = {"timestep": 5e-4, "workers": 1}
     first, again, other = (
-        perturb(predictions["hexagon"], 3, Amounts(0.1, 0.05, 5e-4, 5e-4), seed=seed, **few) for seed in (1, 1, 2)
+        run_trials(predictions["hexagon"], 3, Amounts(0.1, 0.05, 5e-4, 5e-4), seed=seed, **few) for seed in (1, 1, 2)
     )
     assert first.message == again.message
     for one, two, three in zip(first.runs, again.runs, other.runs, strict=True):
@@ -287,7 +287,7 @@ def test_perturbed_executions_repeat_with_the_seed(predictions):
 
 def test_unperturbed_copies_end_as_the_execution_does(predictions):
     done = execute(predictions["heptagon"], timestep=5e-4)
-    copies = perturb(predictions["heptagon"], 2, Amounts(), timestep=5e-4)
+    copies = run_trials(predictions["heptagon"], 2, Amounts(), timestep=5e-4)
     for run in copies.runs:
         np.testing.assert_allclose(run.end, done.course.z[-1], atol=1e-6)
 
@@ -295,7 +295,7 @@ def test_unperturbed_copies_end_as_the_execution_does(predictions):
 def test_small_changes_of_mass_do_no_harm(predictions):
     told = []
     settings = {"tolerance": Tolerance(1e-3, 0.02), "callback": told.append}
-    many = perturb(predictions["heptagon"], 6, Amounts(mass=0.02), **settings)
+    many = run_trials(predictions["heptagon"], 6, Amounts(mass=0.02), **settings)
     assert many.successes == 6
     assert tuple(told) == many.runs
     assert many.interval == pytest.approx((0.6097, 1.0), abs=1e-4)
@@ -305,7 +305,7 @@ def test_a_copy_without_friction_can_be_told():
     """Of a coefficient of 0 any share is 0."""
     scene = eqx.tree_at(lambda s: s.object.friction, wa.load("heptagon"), jnp.array([0.0, 0.1, 0.2]))
     changed = _perturbed(scene, Amounts(friction=0.1), np.random.default_rng(0))
-    told = _summary(scene, changed, np.zeros(5), np.zeros(5), Ending.OK)
+    told = _summary(scene, changed, np.zeros(5), np.zeros(5), ExecutionOutcome.OK)
     assert told.friction[0] == 1.0
     np.testing.assert_allclose(told.friction[1:], np.asarray(changed.object.friction[1:]) / [0.1, 0.2])
     json.dumps(_perturbed_row(told), allow_nan=False)
@@ -315,8 +315,8 @@ def test_a_perturbed_start_touches(predictions):
     scene = predictions["heptagon"].scene
     shift = np.array([4e-4, -3e-4, 2e-4])
     z = start_near(scene, start_of(predictions["heptagon"]), shift)
-    several = contacts(body(scene.object), scene.hand, scene.phases[0].formation)
-    assert np.abs(frames(several, z).gap).max() < 1e-15
+    several = contact_set(rigid_body(scene.object), scene.hand, scene.phases[0].formation)
+    assert np.abs(contact_kinematics(several, z).gap).max() < 1e-15
     moved = z - start_of(predictions["heptagon"])
     assert 1e-5 < np.abs(moved[:2]).max() < 1e-3
 
@@ -325,10 +325,10 @@ def test_a_perturbed_start_is_the_nearest_that_touches(predictions):
     """What is left of a shift, in object radii, lies along the wire; the rest closed gaps."""
     scene, nominal = predictions["heptagon"].scene, start_of(predictions["heptagon"])
     shift = np.array([4e-5, -3e-5, 2e-5])
-    mechanics = system(body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)
+    mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)
     unit = np.asarray(mechanics.configuration_unit)
     z = start_near(scene, nominal, shift)
-    *_, along = np.linalg.svd(np.asarray(normal_rows(mechanics.contacts, jnp.asarray(z / unit))))[2]
+    *_, along = np.linalg.svd(np.asarray(normal_jacobian(mechanics.contacts, jnp.asarray(z / unit))))[2]
     radius = float(mechanics.length)
     given, kept = along[:3] @ shift / radius, along @ ((z - nominal) / unit)
     assert abs(given) > 1e-4
@@ -361,7 +361,7 @@ def test_each_amount_changes_what_it_says(which, predictions):
 def test_copies_start_apart_and_end_alike_however_many_work_on_them(predictions):
     settings = {"timestep": 1e-3, "seed": 2}
     alone, together = (
-        perturb(predictions["hexagon"], 3, Amounts(start=5e-4), workers=workers, **settings) for workers in (1, 2)
+        run_trials(predictions["hexagon"], 3, Amounts(start=5e-4), workers=workers, **settings) for workers in (1, 2)
     )
     ends = [np.stack([run.end for run in one.runs]) for one in (alone, together)]
     np.testing.assert_array_equal(*ends)
@@ -371,30 +371,30 @@ def test_copies_start_apart_and_end_alike_however_many_work_on_them(predictions)
 @pytest.mark.parametrize(
     ("off", "ending"),
     [
-        ((0.0, 0.0, 0.0), Ending.OK),
-        ((0.0, 0.0, 0.008), Ending.OK),
-        ((0.0, 0.0, 0.02), Ending.ASTRAY),
-        ((0.0, 0.0, -0.02), Ending.ASTRAY),
-        ((-0.04, 0.0, 0.0), Ending.CONTACT_LOST),
+        ((0.0, 0.0, 0.0), ExecutionOutcome.OK),
+        ((0.0, 0.0, 0.008), ExecutionOutcome.OK),
+        ((0.0, 0.0, 0.02), ExecutionOutcome.ASTRAY),
+        ((0.0, 0.0, -0.02), ExecutionOutcome.ASTRAY),
+        ((-0.04, 0.0, 0.0), ExecutionOutcome.CONTACT_LOST),
     ],
 )
 def test_an_end_is_judged_by_place_angle_and_contacts(off, ending, predictions):
     target = target_of(predictions["hexagon"])
     z = target + np.append(off, np.zeros(2))
-    assert judge(predictions["hexagon"].scene, z, target, Tolerance(5e-3, 0.01))[0] is ending
+    assert assess_execution(predictions["hexagon"].scene, z, target, Tolerance(5e-3, 0.01))[0] is ending
     near, far = (
-        judge(predictions["hexagon"].scene, target + 2e-3, target, Tolerance(size, 0.01))[0] for size in (5e-3, 2.5e-3)
+        assess_execution(predictions["hexagon"].scene, target + 2e-3, target, Tolerance(size, 0.01))[0] for size in (5e-3, 2.5e-3)
     )
-    assert near is Ending.OK
-    assert far is not Ending.OK
+    assert near is ExecutionOutcome.OK
+    assert far is not ExecutionOutcome.OK
 
 
 @pytest.mark.parametrize(("creep", "why"), [(np.inf, "MuJoCo gave up"), (6e-4, "contacts crept 0.6 mm")])
 def test_a_simulation_that_diverges_is_said(creep, why, predictions, monkeypatch):
-    honest = execution.drive
+    honest = execution.run_schedule
     monkeypatch.setattr(execution, "drive", lambda *a: (honest(*a)[0], creep))
     done = execute(predictions["heptagon"], timestep=1e-3)
-    assert done.ending is Ending.DIVERGED
+    assert done.ending is ExecutionOutcome.DIVERGED
     assert done.message.startswith(f"diverged ({why}: take a shorter time step), ")
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.planning.successors import leaving, touching, ways
+from wholearm_jax.planning.successors import exit_velocity, touching_contacts, successor_formations
 
 
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])
@@ -14,8 +14,8 @@ def test_the_planned_phases_are_among_the_ways(name):
     places = [traced[0].begin, traced[0].end]
     tops = wa.bounds(scene, traced=traced)
     for phase, at, z, top in zip(scene.phases, traced, places, tops, strict=True):
-        assert set(phase.formation.names) <= set(touching(scene, z))
-        same = [way for way in ways(scene, z) if set(way.contacts) == set(phase.formation.names)]
+        assert set(phase.formation.names) <= set(touching_contacts(scene, z))
+        same = [way for way in successor_formations(scene, z) if set(way.contacts) == set(phase.formation.names)]
         length = float(at.table.length)
         way = min(same, key=lambda way: abs(way.length - length))
         assert way.length == pytest.approx(length, rel=1e-3), "charts begin with the same tangent"
@@ -26,15 +26,15 @@ def test_the_planned_phases_are_among_the_ways(name):
 def test_a_fifth_contact_stops_the_ways_that_would_push_into_it():
     scene = wa.load("heptagon")
     z = wa.trace(scene)[0].end
-    assert "finger2:v4" in touching(scene, z)
-    old = [way for way in ways(scene, z) if set(way.contacts) == set(scene.phases[0].formation.names)]
+    assert "finger2:v4" in touching_contacts(scene, z)
+    old = [way for way in successor_formations(scene, z) if set(way.contacts) == set(scene.phases[0].formation.names)]
     assert [way.toward for way in old] == ["x+"], "the slide cannot go on, only back"
 
 
 def test_impacts_are_told():
     scene = wa.load("heptagon")
     end = wa.trace(scene)[0]
-    found = ways(scene, end.end, leaving(end.table))
+    found = successor_formations(scene, end.end, exit_velocity(end.table))
     flip = next(way for way in found if set(way.contacts) == set(scene.phases[1].formation.names))
     assert flip.entering in ("turns back", "pulls")
     onward = [way for way in found if way.entering.endswith("%")]
@@ -69,7 +69,7 @@ def test_what_touches_lies_on_its_feature(length, on_finger):
             ],
         }
     )
-    found = {name.removeprefix("finger1:") for name in touching(scene, scene.start) if name.startswith("finger1")}
+    found = {name.removeprefix("finger1:") for name in touching_contacts(scene, scene.start) if name.startswith("finger1")}
     assert found == on_finger
-    palm = {name for name in touching(scene, scene.start) if name.startswith("palm")}
+    palm = {name for name in touching_contacts(scene, scene.start) if name.startswith("palm")}
     assert palm == {"palm:v0", "palm:v1"}

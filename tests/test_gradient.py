@@ -11,8 +11,8 @@ from test_gradients import nearest_difference
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.phases.gradients import FORWARD, mode, torque_gradient
-from wholearm_jax.phases.plan import least, outcomes
+from wholearm_jax.phases.gradients import MAX_FORWARD_DIRECTIONS, choose_mode, torque_gradient
+from wholearm_jax.phases.plan import plan_margin, simulate_phases
 
 DATA = Path(__file__).parent / "data"
 
@@ -23,11 +23,11 @@ def thinned(torque, rows):
     return wa.torque(times, np.stack([np.interp(times, torque.times, torque.values[:, k]) for k in range(2)], axis=1))
 
 
-@pytest.mark.parametrize(("rows", "expected"), [(FORWARD, "forward"), (FORWARD + 1, "reverse")])
+@pytest.mark.parametrize(("rows", "expected"), [(MAX_FORWARD_DIRECTIONS, "forward"), (MAX_FORWARD_DIRECTIONS + 1, "reverse")])
 def test_both_modes_agree_with_differences(rows, expected):
     scene = wa.load("heptagon")
     schedule, traced = thinned(wa.read_torque(DATA / "heptagon_torque.csv"), rows), wa.trace(scene)
-    assert mode(schedule) == expected
+    assert choose_mode(schedule) == expected
     margin, slope = torque_gradient(scene, schedule, traced=traced)
     assert float(margin) == pytest.approx(wa.simulate(scene, schedule, traced=traced).margin, rel=1e-9)
     way = np.random.default_rng(1).normal(size=(rows, 2)) * 0.005
@@ -50,7 +50,7 @@ def test_who_arrives_early_in_a_batch_keeps_its_gradient():
     pushes = jnp.asarray([[0.6, -0.2], [1.0, 0.5], [0.55, -0.22]])
 
     def margin(push):
-        return least(scene, outcomes(scene, wa.Torque(times, jnp.tile(push, (5, 1))), traced, how))
+        return plan_margin(scene, simulate_phases(scene, wa.Torque(times, jnp.tile(push, (5, 1))), traced, how))
 
     gradients = eqx.filter_jit(jax.vmap(jax.grad(margin)))
     alike = jnp.stack([gradients(jnp.tile(push, (3, 1)))[0] for push in pushes])  # who are alike finish together

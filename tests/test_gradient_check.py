@@ -6,7 +6,7 @@ import equinox as eqx
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.phases.gradient_check import Slope, _steadiest, check_gradient
+from wholearm_jax.phases.gradient_check import DirectionalDerivative, _steadiest, check_gradient
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_all_inputs_of_a_bundled_phase(slide):
     ],
 )
 def test_findings(forward, reverse, differences, uncertainty, finding):
-    assert Slope("torques", 1e-10, forward, reverse, differences, uncertainty).finding == finding
+    assert DirectionalDerivative("torques", 1e-10, forward, reverse, differences, uncertainty).finding == finding
 
 
 def test_a_plan_without_a_margin_has_no_slopes(slide):
@@ -52,4 +52,4 @@ def test_a_plan_without_a_margin_has_no_slopes(slide):
 def test_a_step_without_a_margin_tells_nothing():
     assert _steadiest([math.nan, 1.0, 1.1, 1.1001]) == (pytest.approx(1e-4), 1.1001)
     change, best = _steadiest([math.nan, 1.0, math.inf])
-    assert Slope("hand", 1e-8, 1.0, 1.0, best, change).finding == "unsure"
+    assert DirectionalDerivative("hand", 1e-8, 1.0, 1.0, best, change).finding == "unsure"

@@ -11,12 +11,12 @@ from test_trace import ending_at_its_kink
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.margin.contact_forces import score
-from wholearm_jax.model.schedule import Torque, window
+from wholearm_jax.margin.contact_forces import minimum_margin
+from wholearm_jax.model.schedule import TorqueSchedule, restrict_to_phase
 from wholearm_jax.phases.gradients import torque_gradient
-from wholearm_jax.phases.plan import margin, steps_within
-from wholearm_jax.simulation.integrator import Integration
-from wholearm_jax.simulation.phase_motion import move
+from wholearm_jax.phases.plan import margin, has_torque_jumps
+from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation.phase_motion import simulate_motion
 
 
 def richardson(function, largest):
@@ -46,7 +46,7 @@ def one_phase(name, row, push, change=lambda data: None, duration=0.6):
     scene = wa.parse(data)
     even = wa.quasistatic(scene)
     # The schedule goes on beyond the phase, so that its last row is no kink at the phase's end.
-    return scene, Torque(1.01 * even.times, push * even.values)
+    return scene, TorqueSchedule(1.01 * even.times, push * even.values)
 
 
 def stepping(scene, torque):
@@ -56,17 +56,17 @@ def stepping(scene, torque):
     times, values = np.asarray(torque.times), np.asarray(torque.values)
     doubled = np.sort(np.append(rows, rows[2:-1:3]))
     late = np.append(doubled[1:] == doubled[:-1], False)  # the first of two rows at one time
-    return scene, Torque(jnp.asarray(times[doubled]), jnp.asarray(values[np.where(late, held[doubled], doubled)]))
+    return scene, TorqueSchedule(jnp.asarray(times[doubled]), jnp.asarray(values[np.where(late, held[doubled], doubled)]))
 
 
 def assert_modes_and_differences_agree(scene, torque, seed=3):
     """Slopes of the margin along a random direction of every input but the schedule's times."""
     floats, rest = eqx.partition((scene, torque), eqx.is_inexact_array)
-    steps = steps_within(scene, torque)
+    steps = has_torque_jumps(scene, torque)
 
     def value(floats, adjoint):
         # A tolerance that is an array is data: whoever differentiates a plan like this one shares the programs.
-        how = Integration(adjoint=adjoint, tolerance=jnp.asarray(1e-12), steps=steps)
+        how = IntegratorOptions(adjoint=adjoint, tolerance=jnp.asarray(1e-12), steps=steps)
         return margin(*eqx.combine(floats, rest), how=how)
 
     reverse = jax.grad(lambda floats: value(floats, "both"))(floats)
@@ -122,14 +122,14 @@ def test_a_margin_where_a_wire_ends_beside_a_kink_has_its_derivative(beyond):
     reverses: there is no piece in which forces, and the place of the least, would vary by rounding alone."""
     scene, _ = ending_at_its_kink(beyond)
     torques = wa.torque([0.0, 1.0], [[1.5, -0.9], [-1.2, 0.0]])
-    how = Integration(adjoint="forward", tolerance=1e-10)
+    how = IntegratorOptions(adjoint="forward", tolerance=1e-10)
     (traced,) = wa.trace(scene)
 
     @jax.jit
     def ends(duration):
-        seen = window(torques, jnp.asarray(0.0), duration)
-        motion = move(traced.table, seen, duration, how=how, speed=7.6)
-        found = score(traced.table, seen, duration, motion, how)
+        seen = restrict_to_phase(torques, jnp.asarray(0.0), duration)
+        motion = simulate_motion(traced.table, seen, duration, how=how, speed=7.6)
+        found = minimum_margin(traced.table, seen, duration, motion, how)
         return found.margin, (found.share - motion.share[motion.count], motion.status)
 
     _, change, (early, status) = jax.jvp(ends, (jnp.asarray(1.5),), (jnp.asarray(1.0),), has_aux=True)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import on_panel, powers
+from wholearm_jax.dynamics.path_dynamics import evaluate, locate_panel
 from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.model.scene import replace_duration
-from wholearm_jax.optimisation.rest_transition import SURE, Moving, Near, Resting, handover
-from wholearm_jax.phases.phase import balance_at_start
+from wholearm_jax.optimisation.rest_transition import MIN_REST_MARGIN, Moving, ReachableTorque, Resting, rest_transition
+from wholearm_jax.phases.phase import statics_at_start
 
 RATE = 2.0
 LEAD = 0.25
@@ -18,9 +18,9 @@ LEAD = 0.25
 
 def at_rest(table, piece, s, torque):
     """Acceleration and contact forces at a place of a wire at rest."""
-    panel, xi = powers(table, piece, s)
+    panel, xi = locate_panel(table, piece, s)
     terms = jnp.stack([1.0, 0.0, 0.0, *torque])
-    return float(on_panel(table.acceleration, panel, xi) @ terms), np.asarray(on_panel(table.force, panel, xi) @ terms)
+    return float(evaluate(table.acceleration, panel, xi) @ terms), np.asarray(evaluate(table.force, panel, xi) @ terms)
 
 
 @pytest.fixture(scope="module", params=["heptagon", "hexagon"])
@@ -30,7 +30,7 @@ def change(request):
     traced = wa.trace(scene)
     first, second = (float(top.value) for top in wa.bounds(scene, traced=traced))
     before, onward = Moving(traced[0].table, 1.0, first), Moving(traced[1].table, 1.0, second)
-    return before, Resting(*balance_at_start(scene, scene.phases[1], traced[1]), second), onward
+    return before, Resting(*statics_at_start(scene, scene.phases[1], traced[1]), second), onward
 
 
 def share_of(change, torque, begin):
@@ -41,7 +41,7 @@ def share_of(change, torque, begin):
     setting_out, next_forces = at_rest(onward.table, 0, start, begin)
     one, limit = np.append(1.0, torque), rest.balance.torque_limit
     ahead, behind = ((row @ one) / np.linalg.norm(row[1:] * limit) for row in rest.departure)
-    stays = ahead <= 1e-9 - SURE and behind >= SURE - 1e-9
+    stays = ahead <= 1e-9 - MIN_REST_MARGIN and behind >= MIN_REST_MARGIN - 1e-9
     if not (stays and braking < 0 and abs(setting_out) < 1e-6):
         return -np.inf
     held = rest.balance.support(torque).margin / rest.bound
@@ -50,7 +50,7 @@ def share_of(change, torque, begin):
 
 def test_both_torques_serve_and_the_way_between_them_is_short_enough(change):
     before, rest, onward = change
-    found = handover(before, rest, onward, RATE, LEAD)
+    found = rest_transition(before, rest, onward, RATE, LEAD)
     assert 0.5 < found.share <= 1
     assert share_of(change, found.torque, found.begin) == pytest.approx(found.share, rel=1e-6)
     assert 0 < found.lead <= LEAD
@@ -61,7 +61,7 @@ def test_both_torques_serve_and_the_way_between_them_is_short_enough(change):
 
 def test_no_torques_nearby_or_far_serve_better(change):
     before, rest, onward = change
-    found = handover(before, rest, onward, RATE, LEAD)
+    found = rest_transition(before, rest, onward, RATE, LEAD)
     rng, limit, ahead = np.random.default_rng(1), rest.balance.torque_limit, rest.departure.ahead
     best, tried = -np.inf, 0
     for size in np.repeat([1e-3, 1e-2, 0.1, 0.5], 100):
@@ -77,10 +77,10 @@ def test_no_torques_nearby_or_far_serve_better(change):
 
 def test_a_torque_out_of_reach_is_none(change):
     before, rest, onward = change
-    from_far = Near(-rest.balance.torque_limit, 0.01)
-    assert handover(before, rest, onward, RATE, LEAD, from_far).share == -np.inf
-    free = handover(before, rest, onward, RATE, LEAD)
-    near = handover(before, rest, onward, RATE, LEAD, Near(free.torque, 0.01))
+    from_far = ReachableTorque(-rest.balance.torque_limit, 0.01)
+    assert rest_transition(before, rest, onward, RATE, LEAD, from_far).share == -np.inf
+    free = rest_transition(before, rest, onward, RATE, LEAD)
+    near = rest_transition(before, rest, onward, RATE, LEAD, ReachableTorque(free.torque, 0.01))
     assert np.abs(near.torque - free.torque).max() <= 0.01 + 1e-9
 
 

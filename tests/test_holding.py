@@ -7,16 +7,16 @@ import pytest
 from scipy.optimize import linprog
 
 import wholearm_jax as wa
-from wholearm_jax.execution.rollout import Ending, execute
+from wholearm_jax.execution.rollout import ExecutionOutcome, execute
 from wholearm_jax.files.results import summary
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.margin.quasistatic import hold
-from wholearm_jax.margin.statics import statics, watch
+from wholearm_jax.margin.quasistatic import best_quasistatic_torque
+from wholearm_jax.margin.statics import contact_statics, rest_margin
 from wholearm_jax.model.scene import replace_duration
-from wholearm_jax.model.schedule import padded
-from wholearm_jax.optimisation.rest_transition import Handover, steady
-from wholearm_jax.phases.phase import balance_at_start, run
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.model.schedule import pad_schedule
+from wholearm_jax.optimisation.rest_transition import RestTransition, holding_schedule
+from wholearm_jax.phases.phase import statics_at_start, simulate_phase
+from wholearm_jax.simulation.integrator import IntegratorOptions
 
 HALF, MASS, MU, DRY, LIMIT = 0.03, 0.2, 0.3, 0.01, 1.0
 WEIGHT, HEIGHT = MASS * 9.81, 2 * HALF
@@ -46,7 +46,7 @@ def block(friction=MU, dry=(DRY, DRY), mass=MASS, limits=(LIMIT, LIMIT)):
 
 def of_block(**changed):
     scene = block(**changed)
-    return statics(scene, scene.phases[0].formation, scene.start)
+    return contact_statics(scene, scene.phases[0].formation, scene.start)
 
 
 @pytest.mark.parametrize("torque", [0.005, 0.03, 0.06, 0.3])
@@ -147,14 +147,14 @@ def optimised(slide_hold_flip):
 def test_the_margin_over_time_is_exact(slide_hold_flip):
     """Against many programmes along the way: the least margin lies at a knot, the loss where the balance says."""
     scene, traced = slide_hold_flip
-    balance, _ = balance_at_start(scene, scene.phases[1], traced[1])
+    balance, _ = statics_at_start(scene, scene.phases[1], traced[1])
     best = balance.best().torque
     rng = np.random.default_rng(3)
     losses = 0
     for _ in range(8):
         knots = np.vstack([best + 0.1 * rng.normal(size=2), best + 0.5 * rng.normal(size=(2, 2))])
         schedule = wa.torque([0.0, 0.4, 1.0], knots)
-        held = watch(balance, schedule, 0.1, 0.9)
+        held = rest_margin(balance, schedule, 0.1, 0.9)
         times = np.union1d(np.linspace(0.1, 0.9, 17), [0.4])
         torques = np.stack([np.interp(times, schedule.times, knots[:, k]) for k in range(2)], axis=1)
         margins = np.array([balance.support(torque).margin for torque in torques])
@@ -191,7 +191,7 @@ def test_slide_hold_flip(slide_hold_flip, optimised):
 
 def test_executed_on_free_bodies(optimised):
     done = execute(optimised.result)
-    assert done.ending is Ending.OK
+    assert done.ending is ExecutionOutcome.OK
     at_rest = (done.course.time > 1.0) & (done.course.time < 1.5)
     end = optimised.result.phases[0].traced.end
     off = done.course.z[at_rest, :2] - np.asarray(end)[:2]
@@ -205,7 +205,7 @@ def test_an_object_is_held_where_its_wire_ends(optimised, length):
     table = pause.traced.table
     breaks = table.breaks.at[1:].set(table.breaks[0] + length)
     table = eqx.tree_at(lambda t: t.breaks, table, breaks)
-    found = run(table, padded(optimised.torque), pause.start, pause.duration, Integration(), "hold")
+    found = simulate_phase(table, pad_schedule(optimised.torque), pause.start, pause.duration, IntegratorOptions(), "hold")
     motion = found.motion
     assert wa.Status(int(motion.status)) is wa.Status.STUCK
     assert (int(motion.count), bool(motion.held[0])) == (1, True)
@@ -239,7 +239,7 @@ def test_a_hold_that_the_contacts_cannot_bear_is_named(slide_hold_flip, optimise
 def test_an_object_that_departs_is_not_held(slide_hold_flip, optimised):
     """Backward along the wire as it was traced says `reversed`, forward `not_reached`, each when it departs."""
     scene, traced = slide_hold_flip
-    _, departure = balance_at_start(scene, scene.phases[1], traced[1])
+    _, departure = statics_at_start(scene, scene.phases[1], traced[1])
     base = np.asarray(optimised.torque.values)[31]
     seen = {}
     for row, status in ((departure.ahead, "not_reached"), (departure.behind, "reversed")):
@@ -261,15 +261,15 @@ def test_the_way_to_a_hold_and_on_keeps_the_rate_limit(slide_hold_flip, duration
     """To the best torque and on where there is time for that, or else as near to it as there is."""
     scene, traced = slide_hold_flip
     rate, before, after = 2.0, np.array([0.26, -0.06]), np.array([0.4, -0.15])
-    ends = [Handover(torque, torque, 0.0, 1.0) for torque in (before, after)]
+    ends = [RestTransition(torque, torque, 0.0, 1.0) for torque in (before, after)]
     phase = replace_duration(scene.phases[1], duration)
-    schedule = steady(scene, phase, traced[1], 31, rate, *ends)
+    schedule = holding_schedule(scene, phase, traced[1], 31, rate, *ends)
     times, values = np.asarray(schedule.times), np.asarray(schedule.values)
     rates = np.abs(np.diff(values, axis=0)) / np.diff(times)[:, None]
     np.testing.assert_array_equal(values[[0, -1]], [before, after])
     np.testing.assert_array_equal(times[[0, -1]], [0.0, duration])
     assert rates.max() == pytest.approx(rate, rel=1e-9)
-    balance, departure = balance_at_start(scene, scene.phases[1], traced[1])
+    balance, departure = statics_at_start(scene, scene.phases[1], traced[1])
     best = balance.steadiest(departure).torque
     reached = np.abs(values - best).max(1).min()
     assert reached < 1e-12 if duration == 1.0 else 0 < reached < np.abs(after - best).max()
@@ -287,8 +287,8 @@ def test_motion_that_stops_holds_and_starts_again():
     slide = wa.load("heptagon")
     alone = eqx.tree_at(lambda s: s.phases, slide, slide.phases[:1])
     table = wa.trace(alone)[0].table
-    push, brake, still = (np.asarray(hold(table, table.breaks[0], 0.0, a).torque) for a in (4.0, -6.0, 0.0))
-    again = np.asarray(hold(table, table.breaks[0] + 0.03, 0.0, 4.0).torque)
+    push, brake, still = (np.asarray(best_quasistatic_torque(table, table.breaks[0], 0.0, a).torque) for a in (4.0, -6.0, 0.0))
+    again = np.asarray(best_quasistatic_torque(table, table.breaks[0] + 0.03, 0.0, 4.0).torque)
     times = [0.0, 0.1, 0.11, 0.3, 0.31, 0.5, 0.6, 1.0]
     schedule = wa.torque(times, np.stack([push, push, brake, brake, 0.9 * still, still, again, again]))
     (phase,) = wa.simulate(alone, schedule).phases
@@ -300,7 +300,7 @@ def test_motion_that_stops_holds_and_starts_again():
     stopped = motion.s[int(np.argmax(motion.held))]
     assert float(motion.s[motion.count]) > float(stopped) > float(table.breaks[0])
     z = wa.trajectory(wa.simulate(alone, schedule))[0].z[60]  # at 0.3 s, give or take
-    weakest = statics(alone, alone.phases[0].formation, z).support(0.9 * still)
+    weakest = contact_statics(alone, alone.phases[0].formation, z).support(0.9 * still)
     assert rests[0].margin == pytest.approx(weakest.margin, rel=1e-6)
     for held in rests:
         assert held.lost is None
@@ -321,6 +321,6 @@ def test_a_rest_between_rounded_times_has_its_own_torque():
     until = wa.torque([0.0, 0.3, 0.3, 1.0], [squeeze, squeeze, none, none])
     since = wa.torque([0.0, 0.8, 0.8, 1.0], [none, none, squeeze, squeeze])
     for schedule, start, end in ((until, 0.1, before), (since, after, 1.0)):
-        held = watch(balance, schedule, start, end)
+        held = rest_margin(balance, schedule, start, end)
         assert held.lost is None
         assert held.margin == pytest.approx(balance.support(squeeze).margin, rel=1e-9)

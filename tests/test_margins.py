@@ -8,8 +8,8 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.model.scene import replace_duration
-from wholearm_jax.phases.plan import least, outcomes, roomy, steps_within
-from wholearm_jax.simulation.integrator import Integration, with_room
+from wholearm_jax.phases.plan import plan_margin, simulate_phases, with_plan_step_capacity, has_torque_jumps
+from wholearm_jax.simulation.integrator import IntegratorOptions, with_step_capacity
 
 
 @pytest.fixture(scope="module")
@@ -40,18 +40,18 @@ def test_a_margin_is_of_the_whole_motion_however_many_rows_a_schedule_has(heptag
 
 def test_a_part_of_a_motion_has_no_margin(heptagon):
     scene, torque = heptagon
-    short = outcomes(scene, torque, wa.trace(scene), Integration(max_steps=16))
+    short = simulate_phases(scene, torque, wa.trace(scene), IntegratorOptions(max_steps=16))
     assert wa.Status(int(short[0].verdict.status)) is wa.Status.MAX_STEPS
-    assert float(least(scene, short)) == -np.inf
+    assert float(plan_margin(scene, short)) == -np.inf
 
 
 @pytest.mark.parametrize("rows", [51, 271, 2001])
 def test_there_is_room_for_a_step_at_every_row(heptagon, rows):
     """In what `optimise` simulates as in what `margin` does; up to 128 rows a phase share one program."""
     scene, torque = heptagon
-    assert with_room(Integration(), rows).max_steps >= 2 * rows
-    assert roomy(Integration(), scene, finer(torque, rows)).max_steps >= 2 * rows
-    assert (roomy(Integration(), scene, finer(torque, rows)).max_steps == Integration().max_steps) == (rows <= 128)
+    assert with_step_capacity(IntegratorOptions(), rows).max_steps >= 2 * rows
+    assert with_plan_step_capacity(IntegratorOptions(), scene, finer(torque, rows)).max_steps >= 2 * rows
+    assert (with_plan_step_capacity(IntegratorOptions(), scene, finer(torque, rows)).max_steps == IntegratorOptions().max_steps) == (rows <= 128)
 
 
 @pytest.mark.parametrize("digits", [9, 12])
@@ -79,9 +79,9 @@ def test_a_seam_between_phases_is_no_step_within_one(heptagon):
     def stepping_at(time):
         return wa.torque([0.0, time, time, first + second], np.zeros((4, 2)))
 
-    assert not steps_within(scene, stepping_at(first))
-    assert steps_within(scene, stepping_at(0.99 * first))
-    assert steps_within(scene, stepping_at(1.01 * first))
+    assert not has_torque_jumps(scene, stepping_at(first))
+    assert has_torque_jumps(scene, stepping_at(0.99 * first))
+    assert has_torque_jumps(scene, stepping_at(1.01 * first))
 
 
 def test_durations_that_are_one_are_kept_and_those_in_no_order_refused(heptagon):

@@ -8,10 +8,10 @@ import pytest
 from scipy.optimize import root
 
 import wholearm_jax as wa
-from wholearm_jax.model.contact_kinematics import constraint_rows, constraints, slip_rows
-from wholearm_jax.model.mechanics import system
-from wholearm_jax.model.scene import body
-from wholearm_jax.tracing.path_root import along_wire, newton
+from wholearm_jax.model.contact_kinematics import constraint_jacobian, constraints, tangential_jacobian
+from wholearm_jax.model.mechanics import scaled_mechanics
+from wholearm_jax.model.scene import rigid_body
+from wholearm_jax.tracing.path_root import path_derivatives, solve_on_path
 
 
 @pytest.fixture(scope="module")
@@ -20,34 +20,34 @@ def flip():
     slip turns round."""
     scene = wa.load("heptagon")
     phase, wire = scene.phases[1], wa.trace(scene)[1].wire
-    mechanics = system(body(scene.object), scene.hand, scene.gravity, phase.formation)
+    mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, phase.formation)
     near = wire.nodes[int(wire.first[1]) - 2, 0]
-    return mechanics, near, along_wire(mechanics, near, wire.chart[0]).x, int(jnp.argmin(slip_at(mechanics, wire)))
+    return mechanics, near, path_derivatives(mechanics, near, wire.chart[0]).x, int(jnp.argmin(slip_at(mechanics, wire)))
 
 
 def slip_at(mechanics, wire):
     """How little each contact slips where the first piece ends."""
     place = wire.nodes[int(wire.first[1])].mean(0)
-    return jnp.abs(slip_rows(mechanics.contacts, place) @ along_wire(mechanics, place, wire.chart[0]).x)
+    return jnp.abs(tangential_jacobian(mechanics.contacts, place) @ path_derivatives(mechanics, place, wire.chart[0]).x)
 
 
 def turns(system, z, x, contact):
     """The slip of a contact."""
-    return slip_rows(system.contacts, z)[contact] @ x
+    return tangential_jacobian(system.contacts, z)[contact] @ x
 
 
 def known(mechanics, guess, contact):
     """The same place by MINPACK, from rows alone: its tangent is a null vector of NumPy's."""
 
     def equations(z):
-        rows = np.asarray(constraint_rows(mechanics.contacts, z))
+        rows = np.asarray(constraint_jacobian(mechanics.contacts, z))
         null = np.linalg.svd(rows)[2][-1]
         null = null / (null @ np.linalg.svd(rows0)[2][-1])
         return np.append(
-            constraints(mechanics.contacts, z), np.asarray(slip_rows(mechanics.contacts, z))[contact] @ null
+            constraints(mechanics.contacts, z), np.asarray(tangential_jacobian(mechanics.contacts, z))[contact] @ null
         )
 
-    rows0 = np.asarray(constraint_rows(mechanics.contacts, guess))
+    rows0 = np.asarray(constraint_jacobian(mechanics.contacts, guess))
     found = root(equations, guess, tol=1e-14)
     assert np.abs(found.fun).max() < 1e-12
     return found.x
@@ -55,9 +55,9 @@ def known(mechanics, guess, contact):
 
 def test_a_place_is_the_one_that_a_general_method_finds(flip):
     mechanics, near, u, contact = flip
-    found = newton(turns, mechanics, near, u, contact)
+    found = solve_on_path(turns, mechanics, near, u, contact)
     np.testing.assert_allclose(found.z, known(mechanics, np.asarray(near), contact), atol=1e-11)
-    np.testing.assert_allclose(constraint_rows(mechanics.contacts, found.z) @ found.x, 0.0, atol=1e-14)
+    np.testing.assert_allclose(constraint_jacobian(mechanics.contacts, found.z) @ found.x, 0.0, atol=1e-14)
     assert float(u @ found.x) == pytest.approx(1.0, abs=1e-14)
     assert float(found.residual) < 1e-8
 
@@ -66,8 +66,8 @@ def test_the_digits_double_with_every_second_step(flip):
     """From off the wire, where neither the constraints hold nor the slip vanishes."""
     mechanics, near, u, contact = flip
     far = near + 0.02 * jnp.asarray([1.0, -1.0, 1.0, 1.0, -1.0])
-    exact = newton(turns, mechanics, near, u, contact).z
-    errors = [float(jnp.abs(newton(turns, mechanics, far, u, contact, steps=k).z - exact).max()) for k in range(1, 6)]
+    exact = solve_on_path(turns, mechanics, near, u, contact).z
+    errors = [float(jnp.abs(solve_on_path(turns, mechanics, far, u, contact, steps=k).z - exact).max()) for k in range(1, 6)]
     for before, after in zip(errors, errors[2:], strict=False):
         assert after < before**2 + 1e-14
     assert errors[0] > 1e-4
@@ -77,14 +77,14 @@ def test_the_digits_double_with_every_second_step(flip):
 def test_of_two_places_close_together_the_nearer_is_found(flip):
     """From beside the wire, where what vanishes there says little of how far along it is."""
     mechanics, near, u, contact = flip
-    place = newton(turns, mechanics, near, u, contact).z
+    place = solve_on_path(turns, mechanics, near, u, contact).z
 
     def both(system, z, x):
         s = u @ (z - place)
         return s * (s - 4e-4) + constraints(system.contacts, z)[0]
 
-    across = constraint_rows(mechanics.contacts, place)[0]
-    found = newton(both, mechanics, place + 5e-7 * across / (across @ across), u)
+    across = constraint_jacobian(mechanics.contacts, place)[0]
+    found = solve_on_path(both, mechanics, place + 5e-7 * across / (across @ across), u)
     assert float(u @ (found.z - place)) == pytest.approx(0.0, abs=1e-9)
     assert float(found.residual) < 1e-12
 
@@ -100,14 +100,14 @@ def test_derivatives_of_places_and_tangents(flip, mode):
         return eqx.tree_at(lambda m: m.contacts.point, mechanics, point)
 
     def place(amount):
-        found = newton(turns, moved(amount), near, u, contact)
+        found = solve_on_path(turns, moved(amount), near, u, contact)
         return jnp.stack([found.z, found.x])
 
     step = 1e-4
 
     def exactly(amount):
         z = known(moved(amount), np.asarray(near), contact)
-        return np.stack([z, along_wire(moved(amount), jnp.asarray(z), u).x])
+        return np.stack([z, path_derivatives(moved(amount), jnp.asarray(z), u).x])
 
     one, two = ((exactly(k * step) - exactly(-k * step)) / (2 * k * step) for k in (1, 2))
     np.testing.assert_allclose(mode(place)(0.0), (4 * one - two) / 3, rtol=1e-7, atol=1e-8)
@@ -120,9 +120,9 @@ def test_what_is_not_there_is_not_found(flip):
     def nowhere(system, z, x, level):
         return level + (z[2] - near[2]) ** 2
 
-    found = newton(nowhere, mechanics, near, u, 1.0)
+    found = solve_on_path(nowhere, mechanics, near, u, 1.0)
     assert float(found.residual) > 0.5
-    slope = jax.jacfwd(lambda level: newton(nowhere, mechanics, near, u, level).z)(1.0)
+    slope = jax.jacfwd(lambda level: solve_on_path(nowhere, mechanics, near, u, level).z)(1.0)
     assert bool(jnp.isfinite(found.z).all() & jnp.isfinite(found.x).all() & jnp.isfinite(slope).all())
-    singular = newton(turns, mechanics, near, jnp.zeros(5), 0)
+    singular = solve_on_path(turns, mechanics, near, jnp.zeros(5), 0)
     assert bool(jnp.isfinite(singular.z).all() & jnp.isfinite(singular.x).all())

@@ -11,9 +11,9 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.optimisation.interior_point import COLDEST, JOINED
+from wholearm_jax.optimisation.interior_point import MU_MIN, DEFECT_TOL
 from wholearm_jax.optimisation.solver import CONVERGED
-from wholearm_jax.phases.assessment import ARRIVAL
+from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL
 from wholearm_jax.phases.plan import simulate
 
 # Largest minimum force [N] that direct collocation reached on the same plans at 1 s a phase, equal to the bound.
@@ -43,7 +43,7 @@ def test_the_schedule_alone_carries_the_plan_out_within_its_limits(optimised):
     assert again.margin == pytest.approx(found.result.margin, rel=1e-6)
     for phase in again.phases:
         motion, table = phase.outcome.motion, phase.traced.table
-        assert abs(float(motion.s[motion.count] - table.breaks[-1])) <= ARRIVAL * float(table.length)
+        assert abs(float(motion.s[motion.count] - table.breaks[-1])) <= DEFAULT_ARRIVAL * float(table.length)
 
 
 def test_history_says_what_happened(optimised):
@@ -53,7 +53,7 @@ def test_history_says_what_happened(optimised):
     for row, phase in enumerate(found.result.phases):
         steps = [step for step in found.history if step.phase == row]
         assert [step.step for step in steps if step.start == 0] == list(range(sum(s.start == 0 for s in steps)))
-        ends = [step for step in steps if step.apart < JOINED and step.temperature <= COLDEST]
+        ends = [step for step in steps if step.apart < DEFECT_TOL and step.temperature <= MU_MIN]
         assert phase.margin == pytest.approx(max(step.margin for step in ends), rel=3e-3), "samples of joined intervals"
 
 
@@ -69,7 +69,7 @@ def test_a_start_that_leads_to_a_known_end_is_not_followed_to_it():
         assert found.stopped[row] == CONVERGED
         last = {step.start: step for step in found.history if step.phase == row}
         assert sorted(last) == [0, 1]
-        assert last[0].apart < JOINED < last[1].apart < 1e-2
+        assert last[0].apart < DEFECT_TOL < last[1].apart < 1e-2
         assert last[1].margin == pytest.approx(last[0].margin, rel=0.05)
 
 

@@ -32,9 +32,9 @@ def climb(ramp: Ramp, at, shift=0.0):
 @pytest.fixture
 def folder(tmp_path):
     TRACED.clear()
-    programs.keep(tmp_path)
+    programs.keep_programs(tmp_path)
     yield tmp_path
-    programs.keep(None)
+    programs.keep_programs(None)
 
 
 def call(power=2, at=3.0, **others):
@@ -76,9 +76,9 @@ def test_a_file_that_cannot_be_read_is_written_anew(folder, content):
 def test_a_folder_that_cannot_be_written_to_does_no_harm(tmp_path):
     file = tmp_path / "file"
     file.touch()
-    programs.keep(file)
+    programs.keep_programs(file)
     assert float(call()[0].slope) == 18.0
-    programs.keep(None)
+    programs.keep_programs(None)
 
 
 def test_with_no_folder_each_kind_of_arguments_is_traced_once():
@@ -136,13 +136,13 @@ def test_what_is_put_beside_is_called_once_for_each_kind_after_the_next_program_
         if len(called) == 3:
             all_made.set()
 
-    calls = [programs.beside(note, number, jnp.zeros(size)) for number, size in ((1, 2), (2, 2), (1, 2), (1, 3))]
+    calls = [programs.call_in_background(note, number, jnp.zeros(size)) for number, size in ((1, 2), (2, 2), (1, 2), (1, 3))]
     assert calls[0] is calls[2]
     assert not called
     TRACED.clear()
     call(power=7)
     assert all_made.wait(60)
-    programs.wait(*calls)
+    programs.wait_for(*calls)
     assert [(number, shape) for number, shape, _ in called] == [(1, (2,)), (2, (2,)), (1, (3,))]
     assert all(thread is not threading.current_thread() for *_, thread in called)
 
@@ -159,11 +159,11 @@ def test_who_waits_makes_what_has_not_begun():
         threads.append(threading.current_thread())
         last_made.set()
 
-    calls = programs.beside(first), programs.beside(last)
+    calls = programs.call_in_background(first), programs.call_in_background(last)
     call(power=11)
     assert first_began.wait(60)
     assert not last_made.is_set()
-    programs.wait(*calls)
+    programs.wait_for(*calls)
     assert threads == [threading.current_thread()]
 
 
@@ -177,9 +177,9 @@ def test_who_waits_is_told_what_was_raised_and_may_try_again():
             raise KeyboardInterrupt("by who waits for it")
 
     with pytest.raises(KeyboardInterrupt, match="who waits"):
-        programs.wait(programs.beside(interrupted))
-    programs.wait(programs.beside(interrupted))
-    programs.wait(programs.beside(interrupted))
+        programs.wait_for(programs.call_in_background(interrupted))
+    programs.wait_for(programs.call_in_background(interrupted))
+    programs.wait_for(programs.call_in_background(interrupted))
     assert len(tries) == 2
 
 

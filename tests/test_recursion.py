@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.core.arrays import array
+from wholearm_jax.core.arrays import as_device_array
 from wholearm_jax.optimisation.coupled_phases import stacked_tables
 from wholearm_jax.optimisation.linearisation import Limits, linearise
 from wholearm_jax.optimisation.multiple_shooting import Variables
-from wholearm_jax.optimisation.riccati import SPREAD, nearest, newton_step
+from wholearm_jax.optimisation.riccati import SPREAD, project_step, kkt_step
 from wholearm_jax.phases.plan import trace
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.integrator import IntegratorOptions
 
 KNOTS = 7
 
-linearised, stepped = eqx.filter_jit(linearise), eqx.filter_jit(newton_step)
+linearised, stepped = eqx.filter_jit(linearise), eqx.filter_jit(kkt_step)
 
 
 def _problem(name, count, *, free):
@@ -25,11 +25,11 @@ def _problem(name, count, *, free):
     tables = stacked_tables([at.table for at in trace(wa.load(name))[:count]])
     evenly = np.broadcast_to(np.linspace(0.0, 1.0, KNOTS), (count, KNOTS))
     state = np.stack([evenly, rng.uniform(0.5, 1.5, (count, KNOTS))], axis=2)
-    p = Variables(*map(array, (rng.uniform(-0.5, 0.5, (count, KNOTS, 2)), state, np.zeros(count))))
+    p = Variables(*map(as_device_array, (rng.uniform(-0.5, 0.5, (count, KNOTS, 2)), state, np.zeros(count))))
     one, pinned = np.ones(count), np.zeros((count, KNOTS), bool)
     pinned[0, 0] = True
-    limits = Limits(*map(array, (np.full(2, 40.0), one / (2 if free else 1), one, np.asarray(0.2), pinned, one)))
-    return linearised(p, tables, limits, Integration()), rng
+    limits = Limits(*map(as_device_array, (np.full(2, 40.0), one / (2 if free else 1), one, np.asarray(0.2), pinned, one)))
+    return linearised(p, tables, limits, IntegratorOptions()), rng
 
 
 def _dense(linear):
@@ -73,7 +73,7 @@ def test_the_nearest_step_joins_and_what_it_leaves_is_normal_to_all_that_do(name
     free = np.ones(moves.size, bool)
     free[2 * count * KNOTS : 4 * count * KNOTS] = False
     wanted = np.where(free, rng.normal(size=moves.size), 0.0)
-    way = np.asarray(eqx.filter_jit(nearest)(linear, wanted))
+    way = np.asarray(eqx.filter_jit(project_step)(linear, wanted))
     np.testing.assert_allclose(across @ way, -linear.defect, atol=1e-9 * np.abs(linear.defect).max())
     left = np.where(free & moves, way - wanted, 0.0)
     _, values, right = np.linalg.svd(across[:, moves])
@@ -87,7 +87,7 @@ def test_what_pulls_at_states_pulls_at_the_torques_that_they_follow():
     across, moves = _dense(linear)[1], ~np.asarray(linear.still)
     joined = linear._replace(defect=jnp.zeros_like(linear.defect))
     pull = rng.normal(size=moves.size)
-    way = np.asarray(eqx.filter_jit(nearest)(joined, pull))
+    way = np.asarray(eqx.filter_jit(project_step)(joined, pull))
     free = np.ones(moves.size)
     free[2 * 3 * KNOTS : 4 * 3 * KNOTS] = 0.0
     _, values, right = np.linalg.svd(across[:, moves])

@@ -9,7 +9,7 @@ import pytest
 
 from wholearm_jax.files.results import summary, write_summary, write_torque, write_trajectory
 from wholearm_jax.files.scene_toml import SceneError, load, parse, to_dict
-from wholearm_jax.model.schedule import torque
+from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan import simulate
 from wholearm_jax.report.page import _worst, read_result, render, report
 
@@ -25,7 +25,7 @@ def folder(tmp_path_factory):
     slide = data["phase"][0] | {"arrive": "caught", "duration": 0.3}
     data["phase"] = [slide | {"name": "near", "until": {"x": 0.0}}, slide | {"name": "far"}]
     data["title"] = TITLE
-    result = simulate(parse(data), torque([0.0, 0.3, 0.3, 0.6], [[0.55, -0.24]] * 2 + [[0.5, -0.1]] * 2))
+    result = simulate(parse(data), torque_schedule([0.0, 0.3, 0.3, 0.6], [[0.55, -0.24]] * 2 + [[0.5, -0.1]] * 2))
     assert result.status.label == "ok"
     place = tmp_path_factory.mktemp("result")
     write_torque(result.torque, place / "torque.csv")

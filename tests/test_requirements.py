@@ -6,9 +6,9 @@ import sys
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.ensembles.ensemble import vary
+from wholearm_jax.ensembles.ensemble import make_ensemble
 from wholearm_jax.execution.rollout import execute
-from wholearm_jax.execution.trials import Amounts, perturb
+from wholearm_jax.execution.trials import Amounts, run_trials
 
 
 @pytest.fixture(scope="module")
@@ -33,15 +33,15 @@ WRONG = {
     "tolerance": (lambda s, t, r: wa.optimise(s, tolerance=float("nan")), "tolerance must be positive, not nan"),
     "durations": (lambda s, t, r: wa.optimise(s, durations=(2.0, 1.0)), "durations are"),
     "no scenes": (lambda s, t, r: wa.check([], t), "there are no scenes to stack"),
-    "count of none": (lambda s, t, r: wa.check(vary(s, {"mass": "5%"}), t, count=0), "count must be positive"),
+    "count of none": (lambda s, t, r: wa.check(make_ensemble(s, {"mass": "5%"}), t, count=0), "count must be positive"),
     "more than given": (lambda s, t, r: wa.check([s], t, count=2), "count is 2, but 1 scenes are given"),
-    "count": (lambda s, t, r: wa.check(vary(s, {"mass": "5%"}), t), "an ensemble has no end"),
+    "count": (lambda s, t, r: wa.check(make_ensemble(s, {"mass": "5%"}), t), "an ensemble has no end"),
     "chunk": (lambda s, t, r: wa.check([s], t, chunk=0), "chunk must be positive"),
     "tolerance of check": (lambda s, t, r: wa.check([s], t, tolerance=0.0), "tolerance must be positive"),
     "time step": (lambda s, t, r: execute(r, timestep=-1e-4), "timestep must be positive"),
-    "executions": (lambda s, t, r: perturb(r, 0, Amounts()), "count must be positive"),
-    "shares": (lambda s, t, r: perturb(r, 1, Amounts(mass=1.0)), "of the mass less than 1"),
-    "geometry": (lambda s, t, r: perturb(r, 1, Amounts(geometry=0.05)), "edges of the polygon could cross"),
+    "executions": (lambda s, t, r: run_trials(r, 0, Amounts()), "count must be positive"),
+    "shares": (lambda s, t, r: run_trials(r, 1, Amounts(mass=1.0)), "of the mass less than 1"),
+    "geometry": (lambda s, t, r: run_trials(r, 1, Amounts(geometry=0.05)), "edges of the polygon could cross"),
 }
 
 

@@ -9,11 +9,11 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from wholearm_jax.core.atomic_files import write_whole
+from wholearm_jax.core.atomic_files import write_atomically
 from wholearm_jax.core.status import Status
 from wholearm_jax.files.results import read_torque, summary, write_summary, write_torque, write_trajectory
 from wholearm_jax.files.scene_toml import SceneError, load, parse, to_dict
-from wholearm_jax.model.schedule import torque
+from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan import simulate
 
 HEADER = (
@@ -27,7 +27,7 @@ def pushed():
     data = to_dict(load("heptagon"))
     slide = data["phase"][0] | {"arrive": "caught", "duration": 0.3}
     data["phase"] = [slide | {"name": "near", "until": {"x": 0.0}}, slide | {"name": "far"}]
-    result = simulate(parse(data), torque([0.0, 0.3, 0.3, 0.6], [[0.55, -0.24]] * 2 + [[0.5, -0.1]] * 2))
+    result = simulate(parse(data), torque_schedule([0.0, 0.3, 0.3, 0.6], [[0.55, -0.24]] * 2 + [[0.5, -0.1]] * 2))
     assert result.status is Status.OK, result.message
     return result
 
@@ -35,7 +35,7 @@ def pushed():
 @pytest.fixture(scope="module")
 def still(pushed):
     """The same without torques: friction holds the object."""
-    return simulate(pushed.scene, torque([0.0, 0.6], np.zeros((2, 2))))
+    return simulate(pushed.scene, torque_schedule([0.0, 0.6], np.zeros((2, 2))))
 
 
 def rows_of(path):
@@ -52,7 +52,7 @@ def numbers(row, names):
 
 def test_torque_round_trip_is_exact(tmp_path):
     values = np.random.default_rng(0).normal(size=(6, 2))
-    schedule = torque([0.0, 0.1, 1 / 3, 1 / 3, 2.0, 1e3 / 7], values)
+    schedule = torque_schedule([0.0, 0.1, 1 / 3, 1 / 3, 2.0, 1e3 / 7], values)
     path = tmp_path / "torque.csv"
     write_torque(schedule, path)
     assert path.read_text().splitlines()[0] == "t,tau1,tau2"
@@ -205,7 +205,7 @@ def test_summary_of_a_failure_is_strict_json(still, tmp_path):
 def test_write_whole_replaces_a_file(content, tmp_path):
     path = tmp_path / "file"
     path.write_text("old, and longer")
-    write_whole(path, content)
+    write_atomically(path, content)
     assert path.read_bytes() == (content.encode() if isinstance(content, str) else content)
     assert os.listdir(tmp_path) == ["file"]
 
@@ -219,7 +219,7 @@ def test_write_whole_moves_a_complete_file_into_place(tmp_path, monkeypatch):
         replace(source, target)
 
     monkeypatch.setattr(os, "replace", watched)
-    write_whole(path, "new")
+    write_atomically(path, "new")
     assert seen == [("old", "new", str(tmp_path))]
     assert path.read_text() == "new"
 
@@ -236,7 +236,7 @@ def test_write_whole_leaves_nothing_behind(error, existing, tmp_path, monkeypatc
 
     monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(type(error)):
-        write_whole(path, "new")
+        write_atomically(path, "new")
     assert os.listdir(tmp_path) == (["file"] if existing else [])
     assert not existing or path.read_text() == "old"
 
@@ -246,13 +246,13 @@ def test_write_whole_keeps_permissions(mode, tmp_path):
     path = tmp_path / "file"
     path.write_text("old")
     path.chmod(mode)
-    write_whole(path, "new")
+    write_atomically(path, "new")
     assert path.read_text() == "new"
     assert path.stat().st_mode & 0o777 == mode
 
 
 def test_write_whole_gives_a_new_file_the_permissions_of_any(tmp_path):
-    write_whole(tmp_path / "ours", "new")
+    write_atomically(tmp_path / "ours", "new")
     (tmp_path / "any").write_text("new")
     assert (tmp_path / "ours").stat().st_mode == (tmp_path / "any").stat().st_mode
 
@@ -261,7 +261,7 @@ def test_write_whole_writes_the_file_behind_a_link(tmp_path):
     (tmp_path / "far").mkdir()
     (tmp_path / "far" / "file").write_text("old")
     (tmp_path / "link").symlink_to("far/file")
-    write_whole(tmp_path / "link", "new")
+    write_atomically(tmp_path / "link", "new")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "far" / "file").read_text() == "new"
     assert sorted(os.listdir(tmp_path)) == ["far", "link"]
@@ -270,5 +270,5 @@ def test_write_whole_writes_the_file_behind_a_link(tmp_path):
 def test_write_whole_onto_a_folder(tmp_path):
     (tmp_path / "file").mkdir()
     with pytest.raises(OSError, match="file"):
-        write_whole(tmp_path / "file", "new")
+        write_atomically(tmp_path / "file", "new")
     assert os.listdir(tmp_path) == ["file"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.ensembles.ensemble import vary
+from wholearm_jax.ensembles.ensemble import make_ensemble
 from wholearm_jax.ensembles.robust import optimise_robustly
 from wholearm_jax.model.scene import replace_duration
 
@@ -28,7 +28,7 @@ def told():
 def found(slide, told):
     both = wa.read_torque(Path(__file__).parent / "data" / "heptagon_torque.csv")
     nominal = wa.torque(both.times[:51], both.values[:51])
-    varied = vary(slide, {"friction": "20%"}, seed=1)
+    varied = make_ensemble(slide, {"friction": "20%"}, seed=1)
     return optimise_robustly(
         varied, samples=12, steps=40, arrival=0.02, nominal=nominal, callback=lambda *one: told.append(one)
     )
@@ -52,7 +52,7 @@ def test_the_best_on_the_samples_is_kept(found):
 def test_what_is_told_of_scenes_is_what_checks_find(slide):
     both = wa.read_torque(Path(__file__).parent / "data" / "heptagon_torque.csv")
     nominal = wa.torque(both.times[:51], both.values[:51])
-    varied = vary(slide, {"friction": "20%"}, seed=1)
+    varied = make_ensemble(slide, {"friction": "20%"}, seed=1)
     settings = {"samples": 12, "steps": 1, "quantile": 0.4, "arrival": 0.02}
     found = optimise_robustly(varied, nominal=nominal, **settings)
     checked = wa.check(varied, nominal, count=24, arrival=0.02)
@@ -63,11 +63,11 @@ def test_what_is_told_of_scenes_is_what_checks_find(slide):
 
 def test_numbers_of_samples_and_steps_are_asked_for(slide):
     with pytest.raises(ValueError, match="steps must be positive"):
-        optimise_robustly(vary(slide, {"friction": "20%"}, seed=1), steps=0)
+        optimise_robustly(make_ensemble(slide, {"friction": "20%"}, seed=1), steps=0)
 
 
 def test_a_nominal_schedule_keeps_to_the_plan_and_the_limits(slide):
-    varied, limit = vary(slide, {"friction": "20%"}, seed=1), np.asarray(slide.hand.torque_limit)
+    varied, limit = make_ensemble(slide, {"friction": "20%"}, seed=1), np.asarray(slide.hand.torque_limit)
     beyond, short = (wa.torque([0.0, end], [[0.0, 0.0], share * limit]) for end, share in ((1.0, 1.1), (0.5, 0.1)))
     with pytest.raises(ValueError, match=r"finger 1 is .* N m, its limit"):
         optimise_robustly(varied, nominal=beyond)
@@ -112,7 +112,7 @@ def test_an_object_that_waits_where_nothing_holds_it_does_not_hold(slide):
     both = wa.read_torque(Path(__file__).parent / "data" / "heptagon_torque.csv")
     push = np.asarray(both.values[:51])
     late = eqx.tree_at(lambda s: s.phases, slide, (replace_duration(slide.phases[0], 1.2),))
-    varied, share = vary(late, {"friction": "0.1%"}, seed=1), {}
+    varied, share = make_ensemble(late, {"friction": "0.1%"}, seed=1), {}
     for name, torque in (("squeeze", 0.2 * push[0]), ("open", np.array([-0.05, 0.06]))):
         waiting = wa.torque([0.0, 0.2, *(0.2 + np.asarray(both.times[:51]))], [torque, torque, *push])
         found = optimise_robustly(varied, samples=12, steps=1, arrival=0.02, nominal=waiting)

@@ -11,22 +11,22 @@ from test_against_unreduced import passing
 from test_gradients import assert_modes_and_differences_agree
 
 import wholearm_jax
-from wholearm_jax.dynamics.path_dynamics import on_panel, powers
+from wholearm_jax.dynamics.path_dynamics import evaluate, locate_panel
 from wholearm_jax.files import scene_toml as scene_file
 from wholearm_jax.margin import quasistatic as squeeze
 from wholearm_jax.model.contact_kinematics import (
-    constraint_curvature,
-    constraint_rows,
+    constraint_second_derivative,
+    constraint_jacobian,
     constraints,
-    contacts,
-    placed,
-    slip_rows,
+    contact_set,
+    anchor_rolling,
+    tangential_jacobian,
 )
-from wholearm_jax.model.scene import body, formation
-from wholearm_jax.model.schedule import Torque
-from wholearm_jax.phases.phase import run
-from wholearm_jax.phases.sampling import sample
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.model.scene import rigid_body, contact_formation
+from wholearm_jax.model.schedule import TorqueSchedule
+from wholearm_jax.phases.phase import simulate_phase
+from wholearm_jax.phases.sampling import sample_phase
+from wholearm_jax.simulation.integrator import IntegratorOptions
 
 DURATION = 1.0
 
@@ -69,7 +69,7 @@ def carrying(table, knots=33):
     u = 1.1 * jnp.linspace(0.0, 1.0, knots)
     length, rate = table.length, 1.1 / DURATION
     places, v, a = table.breaks[0] + length * jnp.minimum(u, 1.0) ** 2, 2 * length * u * rate, 2 * length * rate**2
-    motion = jax.vmap(lambda s: squeeze.coefficients(table, s)[0])(places)
+    motion = jax.vmap(lambda s: squeeze.affine_coefficients(table, s)[0])(places)
     rest = motion[:, 0] + motion[:, 1] * v**2 + motion[:, 2] * v
     pull = motion[:, 3:]
     values = pull * ((a - rest) / (pull**2).sum(1))[:, None]
@@ -101,13 +101,13 @@ def test_rows_are_gradients(names):
     """Rows and curvature of the constraints against automatic derivatives, off contact too."""
     scene = wholearm_jax.parse(other_hand(tipping()))
     z, x = jnp.array([0.012, 0.043, -0.3, 1.9, 0.9]), jnp.array([0.3, -0.2, 1.1, -0.7, 0.9])
-    several = contacts(body(scene.object), scene.hand, formation(names))
-    several = placed(several, z + 0.1)
-    rows = constraint_rows(several, z)
+    several = contact_set(rigid_body(scene.object), scene.hand, contact_formation(names))
+    several = anchor_rolling(several, z + 0.1)
+    rows = constraint_jacobian(several, z)
     np.testing.assert_allclose(rows, jax.jacfwd(lambda z: constraints(several, z))(z), atol=1e-15)
     hessian = jax.jacfwd(jax.jacfwd(lambda z: constraints(several, z)))(z)
-    np.testing.assert_allclose(constraint_curvature(several, z, x), x @ hessian @ x, atol=1e-14)
-    np.testing.assert_allclose(rows[1::2], slip_rows(several, z)[1::2], rtol=1e-14)
+    np.testing.assert_allclose(constraint_second_derivative(several, z, x), x @ hessian @ x, atol=1e-14)
+    np.testing.assert_allclose(rows[1::2], tangential_jacobian(several, z)[1::2], rtol=1e-14)
 
 
 def test_the_other_simulation_rolls_without_drift():
@@ -122,18 +122,18 @@ def test_against_unreduced(rolling):
     """Motion and all forces of a passage against the independent simulation of five coordinates."""
     data, traced, torque = rolling
     table, start, length = traced.table, jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = run(table, torque, start, length, Integration(tolerance=1e-13), "moving").motion
+    motion = simulate_phase(table, torque, start, length, IntegratorOptions(tolerance=1e-13), "moving").motion
     assert int(motion.status) == wholearm_jax.Status.LEFT_FORMATION
     end = float(motion.share[motion.count]) * (1 - 1e-12)
     steps = np.asarray(motion.share)[: int(motion.count)]
 
     names = data["phase"][0]["contacts"]
     model = unreduced.Model(data, names)
-    begin = np.asarray(sample(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
+    begin = np.asarray(sample_phase(table, torque, start, length, motion, jnp.zeros(1)).z)[0]
     times, values = np.asarray(torque.times), np.asarray(torque.values)
     followed = model.simulate(begin, data["phase"][0]["toward"], times, values, end * DURATION)
     shares = np.concatenate([steps, np.linspace(0.0, end, 150)])
-    ours = sample(table, torque, start, length, motion, jnp.asarray(shares))
+    ours = sample_phase(table, torque, start, length, motion, jnp.asarray(shares))
     z, z_dot, forces = (np.array(column) for column in zip(*(followed.at(t) for t in shares * DURATION), strict=True))
     count, rolls = len(names), model.rolls
     cn, ct = np.asarray(ours.cn), np.asarray(ours.ct)
@@ -160,23 +160,23 @@ def test_energy(rolling):
     data, traced, torque = rolling
     scene, table = wholearm_jax.parse(data), traced.table
     start, length = jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = run(table, torque, start, length, Integration(tolerance=1e-13, max_steps=512), "moving").motion
+    motion = simulate_phase(table, torque, start, length, IntegratorOptions(tolerance=1e-13, max_steps=512), "moving").motion
     ends = np.asarray(motion.share)[: int(motion.count) + 1]
     x, weight = np.polynomial.legendre.leggauss(8)
     low, high = ends[:-1, None], ends[1:, None]
     shares, weights = ((low + high) / 2 + (high - low) / 2 * x).ravel(), ((high - low) / 2 * weight).ravel() * DURATION
-    at = sample(table, torque, start, length, motion, jnp.asarray(shares))
-    solid, hand, count = body(scene.object), scene.hand, len(data["phase"][0]["contacts"])
+    at = sample_phase(table, torque, start, length, motion, jnp.asarray(shares))
+    solid, hand, count = rigid_body(scene.object), scene.hand, len(data["phase"][0]["contacts"])
     names = [name.removesuffix(" rolling") for name in data["phase"][0]["contacts"]]
-    several = contacts(solid, hand, formation(names))
-    slip = np.asarray(jax.vmap(lambda z, rate: slip_rows(several, z) @ rate)(at.z, at.z_dot))
+    several = contact_set(solid, hand, contact_formation(names))
+    slip = np.asarray(jax.vmap(lambda z, rate: tangential_jacobian(several, z) @ rate)(at.z, at.z_dot))
     joint = np.asarray(at.z_dot)[:, 3:]
     power = (np.asarray(at.torque) * joint).sum(1) + (np.asarray(at.ct)[:, :count] * slip).sum(1)
     power -= (np.asarray(hand.viscous) * joint**2 + np.asarray(hand.dry) * np.abs(joint)).sum(1)
     inertia = np.array([solid.mass, solid.mass, solid.inertia, *hand.inertia], float)
 
     def energy(share):
-        last = sample(table, torque, start, length, motion, jnp.asarray([share]))
+        last = sample_phase(table, torque, start, length, motion, jnp.asarray([share]))
         kinetic = (inertia * np.asarray(last.z_dot)[0] ** 2).sum() / 2
         return kinetic - float(solid.mass) * np.asarray(scene.gravity) @ np.asarray(last.z)[0, :2]
 
@@ -201,12 +201,12 @@ def test_pivot_by_hand():
     vertices = np.array(data["object"]["vertices"]) - centroid
     mass, inertia = data["object"]["mass"], data["object"]["mass"] * second / area
     s = np.linspace(float(table.breaks[0]), float(table.breaks[-1]), 9)[1:-1]
-    _, force = (np.asarray(a) for a in jax.vmap(squeeze.coefficients, (None, 0))(table, jnp.asarray(s)))
+    _, force = (np.asarray(a) for a in jax.vmap(squeeze.affine_coefficients, (None, 0))(table, jnp.asarray(s)))
     torque, v = np.array([0.11, -0.34]), 0.7
     for where, f_rows in zip(s, force, strict=True):
-        panel, xi = powers(table, jnp.asarray(0), jnp.asarray(where))
-        z = np.asarray(on_panel(table.configuration, panel, xi))
-        x = np.asarray(on_panel(table.velocity, panel, xi))
+        panel, xi = locate_panel(table, jnp.asarray(0), jnp.asarray(where))
+        z = np.asarray(evaluate(table.configuration, panel, xi))
+        x = np.asarray(evaluate(table.velocity, panel, xi))
         spin = x[2] * v
         rates, bends, arms, pushes = [], [], [], []
         turn = np.array([[np.cos(z[2]), -np.sin(z[2])], [np.sin(z[2]), np.cos(z[2])]])
@@ -263,12 +263,12 @@ def test_cone_counts_toward_the_margin():
 
 
 def test_bound_and_hold_see_the_cone(rolling):
-    """`hold` against a dense scan of the squeeze; the bound is not below it."""
+    """`best_quasistatic_torque` against a dense scan of the squeeze; the bound is not below it."""
     _, traced, _ = rolling
     table = traced.table
     s = table.breaks[0] + 0.4 * table.length
-    found = squeeze.hold(table, s)
-    motion, force = (np.asarray(a) for a in squeeze.coefficients(table, s))
+    found = squeeze.best_quasistatic_torque(table, s)
+    motion, force = (np.asarray(a) for a in squeeze.affine_coefficients(table, s))
     pull = motion[3:]
     base, free = -pull * motion[0] / (pull @ pull), np.array([-pull[1], pull[0]]) / np.linalg.norm(pull)
     tau = base + np.linspace(-3.0, 3.0, 200001)[:, None] * free
@@ -278,8 +278,8 @@ def test_bound_and_hold_see_the_cone(rolling):
     slack[np.any(np.abs(tau) > np.asarray(table.torque_limit), axis=1)] = -np.inf
     assert float(found.margin) == pytest.approx(slack.max(), abs=2e-3)
     assert float(found.margin) >= slack.max() - 1e-12
-    at = jax.vmap(lambda s: squeeze.hold(table, s).margin)(table.breaks[0] + table.length * jnp.linspace(0.0, 1.0, 65))
-    assert float(squeeze.bound(table, jnp.asarray(DURATION), False, False).value) >= float(at.min()) - 1e-9
+    at = jax.vmap(lambda s: squeeze.best_quasistatic_torque(table, s).margin)(table.breaks[0] + table.length * jnp.linspace(0.0, 1.0, 65))
+    assert float(squeeze.margin_upper_bound(table, jnp.asarray(DURATION), False, False).value) >= float(at.min()) - 1e-9
 
 
 def test_gradients():
@@ -288,7 +288,7 @@ def test_gradients():
     data["phase"][0]["duration"] = 0.6
     scene = wholearm_jax.parse(data)
     even = wholearm_jax.quasistatic(scene)
-    assert_modes_and_differences_agree(scene, Torque(1.01 * even.times, 1.01 * even.values), seed=5)
+    assert_modes_and_differences_agree(scene, TorqueSchedule(1.01 * even.times, 1.01 * even.values), seed=5)
 
 
 def test_mirror_image():

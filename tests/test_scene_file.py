@@ -11,7 +11,7 @@ import pytest
 import tomli_w
 
 from wholearm_jax.files.scene_toml import SceneError, bundled, load, parse, save, to_dict
-from wholearm_jax.model.scene import body, heading
+from wholearm_jax.model.scene import rigid_body, path_target
 
 NAN, INF = float("nan"), float("inf")
 SQUARE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
@@ -147,7 +147,7 @@ def test_gravity_vector():
 def test_polygons_accepted(vertices):
     scene = parse(polygon_scene(vertices))
     assert int(scene.object.count) == len(vertices)
-    assert float(body(scene.object).inertia) > 0
+    assert float(rigid_body(scene.object).inertia) > 0
 
 
 @pytest.mark.parametrize(
@@ -354,6 +354,6 @@ def test_parse_names_its_source():
 
 def test_a_phase_without_a_heading_is_not_written():
     scene = load("heptagon")
-    scene = eqx.tree_at(lambda s: s.phases[0].heading, scene, heading(None))
+    scene = eqx.tree_at(lambda s: s.phases[0].heading, scene, path_target(None))
     with pytest.raises(ValueError, match="'slide left' does not say which way"):
         to_dict(scene)

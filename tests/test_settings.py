@@ -11,7 +11,7 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.core import config as settings
-from wholearm_jax.optimisation.riccati import Quadratic, _back, _order, _Stages
+from wholearm_jax.optimisation.riccati import ParametricLQ, _backward_pass, _stage_layout, _LQStages
 
 LOOKING = """
 import jax
@@ -44,23 +44,23 @@ def test_a_loop_is_one_function():
 
 def test_the_recursion_over_knots_is_one_function():
     """Calls of libraries, as for products of matrices, would keep the loop about them in pieces."""
-    at = _order(1, 9)
-    stages = _Stages(*(jnp.ones((1, 8, rows, at.size + 2)) for rows in (at.size + 2, 4, 2)))
-    quadratic = Quadratic(*(jnp.ones(()) for _ in Quadratic._fields))
-    text = jax.jit(lambda stages: _back(at, stages, quadratic)).lower(stages).compile().as_text()
+    at = _stage_layout(1, 9)
+    stages = _LQStages(*(jnp.ones((1, 8, rows, at.size + 2)) for rows in (at.size + 2, 4, 2)))
+    quadratic = ParametricLQ(*(jnp.ones(()) for _ in ParametricLQ._fields))
+    text = jax.jit(lambda stages: _backward_pass(at, stages, quadratic)).lower(stages).compile().as_text()
     assert text.count(" while(") == text.count('xla_cpu_small_call="true"') > 0
 
 
 @pytest.mark.parametrize(
     ("compiled", "given", "left"),
     [
-        ("quickly", "", [*settings.ALWAYS, *settings.QUICKLY]),
-        ("well", "", [*settings.ALWAYS]),
-        ("well", "--xla_dump_to=here", ["--xla_dump_to=here", *settings.ALWAYS]),
+        ("quickly", "", [*settings.FLAGS_ALWAYS, *settings.FLAGS_FOR_COMPILE_TIME]),
+        ("well", "", [*settings.FLAGS_ALWAYS]),
+        ("well", "--xla_dump_to=here", ["--xla_dump_to=here", *settings.FLAGS_ALWAYS]),
         (
             "quickly",
             "--xla_cpu_use_fusion_emitters=true --xla_backend_extra_options=one=2",
-            ["--xla_cpu_use_fusion_emitters=true", "--xla_backend_extra_options=one=2", *settings.QUICKLY[1:]],
+            ["--xla_cpu_use_fusion_emitters=true", "--xla_backend_extra_options=one=2", *settings.FLAGS_FOR_COMPILE_TIME[1:]],
         ),
     ],
 )

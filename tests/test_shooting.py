@@ -8,21 +8,21 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.margin import quasistatic as squeeze
-from wholearm_jax.margin.contact_forces import arcs, on_arc
-from wholearm_jax.model.schedule import window
-from wholearm_jax.optimisation.interior_point import moved
+from wholearm_jax.margin.contact_forces import dense_output, evaluate_dense
+from wholearm_jax.model.schedule import restrict_to_phase
+from wholearm_jax.optimisation.interior_point import retract
 from wholearm_jax.optimisation.linearisation import Limits
-from wholearm_jax.optimisation.multiple_shooting import Variables, local, shoot
+from wholearm_jax.optimisation.multiple_shooting import Variables, interval_inputs, simulate_intervals
 from wholearm_jax.phases.plan import trace
-from wholearm_jax.simulation.integrator import Integration
-from wholearm_jax.simulation.phase_motion import move
+from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation.phase_motion import simulate_motion
 
-HOW = Integration()
+HOW = IntegratorOptions()
 
 
 def _shot(table, intervals, q):
     """One interval: its parts, and its end."""
-    shot = shoot(table, HOW, intervals, q[None])
+    shot = simulate_intervals(table, HOW, intervals, q[None])
     return shot.parts, shot.end[0]
 
 
@@ -48,9 +48,9 @@ def test_an_interval_crosses_a_reversal_as_the_simulation_does(flip):
     assert (np.asarray(parts.weight) > 0).sum() == 18, "two parts of one step with nine samples"
     values = q[2:6].reshape(2, 2) * flip.torque_limit
     duration = jnp.exp(q[6]) / intervals
-    seen = window(wa.torque([0.0, float(duration)], values), jnp.zeros(()), duration)
+    seen = restrict_to_phase(wa.torque([0.0, float(duration)], values), jnp.zeros(()), duration)
     s = flip.breaks[0] + flip.length * q[0]
-    motion = move(flip, seen, duration, how=Integration(tolerance=1e-13), s=s, speed=flip.length * q[1])
+    motion = simulate_motion(flip, seen, duration, how=IntegratorOptions(tolerance=1e-13), s=s, speed=flip.length * q[1])
     s_end = (motion.s[motion.count] - flip.breaks[0]) / flip.length
     v_end = motion.w[motion.count] / duration / flip.length
     np.testing.assert_allclose(end, [s_end, v_end], rtol=1e-9)
@@ -60,14 +60,14 @@ def test_paces_bound_the_speed_between_knots(flip):
     """An interval that goes forward at both ends and backward between them shows it."""
     intervals, speed, brake = 50, 1e-3, 4.0
     s, v = flip.breaks[0] + 0.3 * flip.length, speed * flip.length
-    torque = [squeeze.hold(flip, s, v, a).torque / flip.torque_limit for a in (-brake, brake)]
+    torque = [squeeze.best_quasistatic_torque(flip, s, v, a).torque / flip.torque_limit for a in (-brake, brake)]
     q = jnp.concatenate([jnp.array([0.3, speed]), *torque, jnp.zeros(1)])
     parts, end = _shot(flip, intervals, q)
-    seen = window(wa.torque([0.0, 1 / intervals], q[2:6].reshape(2, 2) * flip.torque_limit), 0.0, 1 / intervals)
-    motion = move(flip, seen, jnp.asarray(1 / intervals), how=Integration(tolerance=1e-12), s=s, speed=v, free=True)
-    steps = arcs(flip, seen, 1 / intervals, motion)
+    seen = restrict_to_phase(wa.torque([0.0, 1 / intervals], q[2:6].reshape(2, 2) * flip.torque_limit), 0.0, 1 / intervals)
+    motion = simulate_motion(flip, seen, jnp.asarray(1 / intervals), how=IntegratorOptions(tolerance=1e-12), s=s, speed=v, free=True)
+    steps = dense_output(flip, seen, 1 / intervals, motion)
     places = jnp.linspace(0.0, 1.0, 101)
-    each = jax.vmap(lambda k: jax.vmap(lambda xi: on_arc(jax.tree.map(lambda a: a[k], steps), xi)[2])(places))
+    each = jax.vmap(lambda k: jax.vmap(lambda xi: evaluate_dense(jax.tree.map(lambda a: a[k], steps), xi)[2])(places))
     speeds = np.asarray(each(np.arange(int(motion.count)))) * intervals / float(flip.length)
     assert speeds[0, 0] == pytest.approx(speed)
     assert float(end[1]) > 0 > speeds.min()
@@ -110,7 +110,7 @@ def test_joined_intervals_are_the_phase(knots, late, near):
     assert off[-1] < late
     state = np.stack([(motion.s[np.array(at)] - table.breaks[0]), motion.w[np.array(at)]], axis=1) / float(table.length)
     p = Variables((found.torque.values / table.torque_limit)[None], jnp.asarray(state)[None], jnp.zeros(1))
-    ends = shoot(table, HOW, knots - 1, local(p)[0]).end
+    ends = simulate_intervals(table, HOW, knots - 1, interval_inputs(p)[0]).end
     np.testing.assert_allclose(ends[:-1], state[1:-1], atol=1e-8)
     np.testing.assert_allclose(ends[-1], state[-1], atol=near)  # the simulation lands on the wire's end or on rest
 
@@ -125,9 +125,9 @@ def test_a_curved_step_starts_along_its_direction_and_keeps_pinned_torques(flip)
     pinned[0, 0] = True
     one = jnp.ones(())
     limits = Limits(jnp.full(2, jnp.inf), one[None], one[None], 0 * one, jnp.asarray(pinned), jnp.ones(1))
-    _, tangent = jax.jvp(lambda share: moved(p, way, share, tables, limits), (0.0,), (1.0,))
+    _, tangent = jax.jvp(lambda share: retract(p, way, share, tables, limits), (0.0,), (1.0,))
     for got, want in zip(jax.tree.leaves(tangent), jax.tree.leaves(way), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-9)
-    there = moved(p, way, 0.05, tables, limits)
+    there = retract(p, way, 0.05, tables, limits)
     np.testing.assert_allclose(there.torque[0, 0], p.torque[0, 0] + 0.05 * way.torque[0, 0], rtol=1e-12)
     assert float(jnp.abs(there.torque[0, 1:] - p.torque[0, 1:] - 0.05 * way.torque[0, 1:]).max()) > 1e-4

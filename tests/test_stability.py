@@ -12,21 +12,21 @@ from matplotlib.path import Path
 from test_gradients import nearest_difference
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import balance, blank, on_panel, powers
-from wholearm_jax.margin.contact_forces import REFINED, SAMPLES, arc, score
-from wholearm_jax.margin.quasistatic import hold, holds
-from wholearm_jax.model.contact_kinematics import frames, gaps
-from wholearm_jax.model.mechanics import system
-from wholearm_jax.model.scene import body
-from wholearm_jax.model.schedule import window
-from wholearm_jax.phases.phase import ending, prepare
-from wholearm_jax.phases.plan import outcomes
-from wholearm_jax.phases.sampling import sample
-from wholearm_jax.simulation.integrator import Integration
-from wholearm_jax.simulation.phase_motion import move
-from wholearm_jax.tracing.events import Watched, crossings
+from wholearm_jax.dynamics.path_dynamics import equations_of_motion, placeholder_dynamics, evaluate, locate_panel
+from wholearm_jax.margin.contact_forces import MAX_REFINED, SAMPLES_PER_STEP, quintic_hermite, minimum_margin
+from wholearm_jax.margin.quasistatic import best_quasistatic_torque, best_quasistatic_torque_batch
+from wholearm_jax.model.contact_kinematics import contact_kinematics, gaps
+from wholearm_jax.model.mechanics import scaled_mechanics
+from wholearm_jax.model.scene import rigid_body
+from wholearm_jax.model.schedule import restrict_to_phase
+from wholearm_jax.phases.phase import describe_end, trace_phase
+from wholearm_jax.phases.plan import simulate_phases
+from wholearm_jax.phases.sampling import sample_phase
+from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation.phase_motion import simulate_motion
+from wholearm_jax.tracing.events import EventValues, detect_events
 from wholearm_jax.tracing.path import Resolution
-from wholearm_jax.tracing.projection import _pierced
+from wholearm_jax.tracing.projection import _link_penetrates_object
 
 
 def scene(vertices, contacts, toward, start, *, joint, length, offset=(0.0, 0.0)):
@@ -48,7 +48,7 @@ def scene(vertices, contacts, toward, start, *, joint, length, offset=(0.0, 0.0)
 
 
 def mechanics(scene):
-    return system(body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)
+    return scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)
 
 
 def turning():
@@ -75,9 +75,9 @@ def test_a_wire_may_turn_far():
     assert met, "the wire stays in one chart: it is no test"
 
     def read(piece, s):
-        panel, xi = powers(table, jnp.asarray(piece), s)
+        panel, xi = locate_panel(table, jnp.asarray(piece), s)
         unit = formation.configuration_unit
-        return on_panel(table.configuration, panel, xi) / unit, on_panel(table.velocity, panel, xi) / unit
+        return evaluate(table.configuration, panel, xi) / unit, evaluate(table.velocity, panel, xi) / unit
 
     for k in met:
         before, after = read(k - 1, table.breaks[k]), read(k, table.breaks[k])
@@ -100,7 +100,7 @@ def test_derivatives_pass_from_chart_to_chart():
     u = jnp.asarray(knots / 1.6)
     places = table.length * jnp.minimum(u, 1.0) ** 2
     rate = 1 / 1.6
-    held = holds(table, places, 2 * table.length * u * rate, jnp.full(7, 2 * table.length * rate**2))
+    held = best_quasistatic_torque_batch(table, places, 2 * table.length * u * rate, jnp.full(7, 2 * table.length * rate**2))
     schedule = wa.torque(knots, held.torque)
     inputs, rest = eqx.partition((edge, schedule), eqx.is_inexact_array)
     still = jax.tree.map(jnp.zeros_like, inputs)
@@ -115,7 +115,7 @@ def test_derivatives_pass_from_chart_to_chart():
         # All inputs have tangents and the tolerance is data: other tests of derivatives share the programs.
         moved, torque = eqx.combine(inputs, rest)
         at = wa.trace(moved)
-        found = outcomes(moved, torque, at, Integration(adjoint=adjoint, tolerance=jnp.asarray(1e-12)))[0]
+        found = simulate_phases(moved, torque, at, IntegratorOptions(adjoint=adjoint, tolerance=jnp.asarray(1e-12)))[0]
         share = found.motion.share[found.motion.count]
         return jnp.concatenate([at[0].end, jnp.stack([share, found.score.margin])])
 
@@ -151,24 +151,24 @@ def test_wedging_on_the_way_back_does_not_spoil_the_table():
     rough = eqx.tree_at(lambda s: s.object.friction, name, jnp.full(3, 0.7))
     phase = rough.phases[1]
     heading = eqx.tree_at(lambda h: h.sign, phase.heading, -phase.heading.sign)
-    solid = body(rough.object)
-    at = prepare(solid, rough.hand, rough.gravity, phase.formation, end, heading)
+    solid = rigid_body(rough.object)
+    at = trace_phase(solid, rough.hand, rough.gravity, phase.formation, end, heading)
     table, wire = at.table, at.wire
     assert int(table.status) == wa.Status.OK
     assert float(table.error) < 1e-9
-    formation = system(solid, rough.hand, rough.gravity, phase.formation)
+    formation = scaled_mechanics(solid, rough.hand, rough.gravity, phase.formation)
     turned = []
     for s in np.linspace(0.02, 0.98, 60) * float(table.length):
         piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
-        panel, xi = powers(table, piece, jnp.asarray(s))
-        z = on_panel(table.configuration, panel, xi) / formation.configuration_unit
-        x = on_panel(table.velocity, panel, xi) / formation.configuration_unit
+        panel, xi = locate_panel(table, piece, jnp.asarray(s))
+        z = evaluate(table.configuration, panel, xi) / formation.configuration_unit
+        x = evaluate(table.velocity, panel, xi) / formation.configuration_unit
         signs = wire.slip_sign[piece], wire.joint_sign[piece]
-        back, right = balance(formation, z, x, 0 * x, -signs[0], -signs[1])
-        smooth, _ = balance(formation, z, x, 0 * x, 0 * signs[0], signs[1])
+        back, right = equations_of_motion(formation, z, x, 0 * x, -signs[0], -signs[1])
+        smooth, _ = equations_of_motion(formation, z, x, 0 * x, 0 * signs[0], signs[1])
         turned.append(float(jnp.linalg.det(back) * jnp.linalg.det(smooth)))
         exact = jnp.linalg.solve(back, right)[0, jnp.array([0, 3, 4])]
-        np.testing.assert_array_equal(np.sign(on_panel(table.backward, panel, xi)), np.sign(exact))
+        np.testing.assert_array_equal(np.sign(evaluate(table.backward, panel, xi)), np.sign(exact))
     assert min(turned) < 0 < max(turned), "nothing wedges: it is no test"
 
 
@@ -181,7 +181,7 @@ class _Track(NamedTuple):
 
 def track(breaks, factor, knots=2):
     """Pieces that end at `breaks`, at whose beginnings `ds/dt` is multiplied by `factor`."""
-    table = blank(Resolution(len(factor), len(factor), 4))
+    table = placeholder_dynamics(Resolution(len(factor), len(factor), 4))
     rows = jnp.arange(len(factor))
     table = eqx.tree_at(
         lambda t: (t.breaks, t.count, t.factor, t.first),
@@ -189,14 +189,14 @@ def track(breaks, factor, knots=2):
         (jnp.asarray(breaks), jnp.asarray(len(factor)), jnp.asarray(factor), rows),
     )
     schedule = wa.torque(np.linspace(0.0, 1.0, knots), np.zeros((knots, 2)))
-    seen = window(schedule, jnp.asarray(0.0), jnp.asarray(1.0))
+    seen = restrict_to_phase(schedule, jnp.asarray(0.0), jnp.asarray(1.0))
     return _Track(table, seen)
 
 
 def test_a_piece_crossed_in_one_step_keeps_its_speed():
     """Behind a change of chart the step that already passes the next one starts at the new chart's speed."""
     table, seen = track([0.0, 1.0, 1.001, 99.0], [1.0, 2.0, 3.0])
-    motion = move(table, seen, jnp.asarray(1.0), how=Integration(), speed=4.0)
+    motion = simulate_motion(table, seen, jnp.asarray(1.0), how=IntegratorOptions(), speed=4.0)
     last = int(motion.count)
     assert float(motion.w[last]) == pytest.approx(24.0, rel=1e-12)
     assert float(motion.share[last]) == 1.0
@@ -209,7 +209,7 @@ def test_a_step_as_short_as_rounding_keeps_its_speed():
     here, now = 0.6460973036766916, 0.8463721297745421
     share = jnp.array([now, np.nextafter(now, 1.0)])
     s = jnp.array([here, np.nextafter(np.nextafter(here, 1.0), 1.0)])
-    quintic = arc(table, seen, jnp.asarray(1.0), share, s, jnp.array([1.5, 1.5]), 0, 0, True)
+    quintic = quintic_hermite(table, seen, jnp.asarray(1.0), share, s, jnp.array([1.5, 1.5]), 0, 0, True)
     slope = np.polynomial.polynomial.polyder(np.asarray(quintic))
     speed = np.polynomial.polynomial.polyval(np.linspace(0, 1, 7), slope) / float(share[1] - share[0])
     np.testing.assert_allclose(speed, 1.5, rtol=1e-12)
@@ -220,14 +220,14 @@ def test_a_step_that_takes_no_time_says_nothing():
     table, seen = track([0.0, 99.0], [1.0])
     pulls_at_rest = jnp.zeros((1, 4, 4, 5)).at[0, 0, :, :2].set(jnp.array([-1.0, 1.0]))
     table = eqx.tree_at(lambda t: t.force, table, pulls_at_rest)
-    motion = move(table, seen, jnp.asarray(1.0), how=Integration(), speed=4.0)
+    motion = simulate_motion(table, seen, jnp.asarray(1.0), how=IntegratorOptions(), speed=4.0)
     motion = motion._replace(entry_w=motion.entry_w.at[motion.count].set(4.0), count=motion.count + 1)
     assert float(motion.share[motion.count - 1]) == float(motion.share[motion.count]) == 1.0
-    found = score(table, seen, jnp.asarray(1.0), motion, Integration())
+    found = minimum_margin(table, seen, jnp.asarray(1.0), motion, IntegratorOptions())
     assert float(found.margin) == pytest.approx(15.0, rel=1e-12)
     assert float(found.lost) == np.inf
     schedule = wa.torque([0.0, 1.0], np.zeros((2, 2)))
-    course = sample(table, schedule, jnp.asarray(0.0), jnp.asarray(1.0), motion, jnp.array([0.5, 1.0]))
+    course = sample_phase(table, schedule, jnp.asarray(0.0), jnp.asarray(1.0), motion, jnp.array([0.5, 1.0]))
     np.testing.assert_allclose(course.cn, 15.0, rtol=1e-12)
 
 
@@ -235,19 +235,19 @@ def test_a_step_that_takes_no_time_says_nothing():
 def test_a_dip_between_samples_is_found_among_many_low_steps(floor):
     """One piece of many has a force that falls from above all others' to far below them within a third of a step, or
     below zero for less than any sample shows."""
-    count, deep = 2 * REFINED, REFINED + 1
+    count, deep = 2 * MAX_REFINED, MAX_REFINED + 1
     table, seen = track(np.append(np.arange(count), 99.0), np.ones(count))
-    motion = move(table, seen, jnp.asarray(1.0), how=Integration(), speed=float(count - 1))
+    motion = simulate_motion(table, seen, jnp.asarray(1.0), how=IntegratorOptions(), speed=float(count - 1))
     places = np.asarray(motion.s)[: int(motion.count) + 1]
     last = np.searchsorted(places, deep + 1.0)
-    half = (places[last] - places[last - 1]) / (SAMPLES - 1)  # in xi, which goes from -1 to 1 in every piece
+    half = (places[last] - places[last - 1]) / (SAMPLES_PER_STEP - 1)  # in xi, which goes from -1 to 1 in every piece
     lowest = 2 * ((places[last] + places[last - 1]) / 2 - deep) - 1 + half
     steepness = 8.0 / half**2
     forces = np.zeros((count, 4, 4, 5))
     forces[:, 0, :, 0] = 1.0
     forces[deep, :3, 2, 0] = [floor + steepness * lowest**2, -2 * steepness * lowest, steepness]
     table = eqx.tree_at(lambda t: t.force, table, jnp.asarray(forces))
-    found = score(table, seen, jnp.asarray(1.0), motion, Integration())
+    found = minimum_margin(table, seen, jnp.asarray(1.0), motion, IntegratorOptions())
     assert float(found.margin) == pytest.approx(floor, abs=1e-9)
     assert int(found.contact) == 2
     assert float(found.s) == pytest.approx(deep + (lowest + 1) / 2, abs=1e-6)
@@ -266,11 +266,11 @@ def test_what_passes_and_comes_back_within_a_step_is_met_on_its_way_down(side):
 
     def at(s):
         values, rates = jnp.array([side * gap(s)]), jnp.array([side * gap.deriv()(s)])
-        return Watched(jnp.append(values, steady), jnp.append(rates, 0.0), inside)
+        return EventValues(jnp.append(values, steady), jnp.append(rates, 0.0), inside)
 
     assert gap(step) > 0 > gap(0.5 * step)
     for end in (step, 0.999 * step):  # back outside, and not yet
-        crossed, where = crossings(watch, at(0.0), at(end), end, 1e-16)
+        crossed, where = detect_events(watch, at(0.0), at(end), end, 1e-16)
         assert list(np.asarray(crossed)) == [True, False]
         assert float(where[0] * end) == pytest.approx(0.3 * step, rel=1e-9)
 
@@ -307,7 +307,7 @@ def test_a_vertex_stops_at_the_back_of_a_finger():
     notched = eqx.tree_at(lambda s: s.hand.length, notched, notched.hand.length.at[0].set(0.24942))
     traced = wa.trace(notched)[0]
     assert int(traced.table.status) == wa.Status.OK
-    assert ending(traced, notched.phases[0], 16) == "finger1:v4 is made"
+    assert describe_end(traced, notched.phases[0], 16) == "finger1:v4 is made"
     side = np.subtract(lower[3], lower[4])  # from the rim to the bottom, where the tip is: along the finger at the end
 
     def across(z):
@@ -331,7 +331,7 @@ def test_the_hand_s_corners_stop_the_object(offset, corner):
     tipping = scene(block, contacts, "phi-", start, joint=(0.8, -0.8), length=2.5, offset=(offset, 0.0))
     traced = wa.trace(tipping)[0]
     assert int(traced.table.status) == wa.Status.OK
-    assert ending(traced, tipping.phases[0], 8) == f"e1 meets {corner}"
+    assert describe_end(traced, tipping.phases[0], 8) == f"e1 meets {corner}"
     x, y, phi, theta, _ = np.asarray(traced.end)
     met = np.array([0.8, 0.0]) + max(offset, 0.0) * np.array([-np.sin(theta), np.cos(theta)])
     across = np.array([np.cos(phi), np.sin(phi)]) @ (met - [x, y])
@@ -349,14 +349,14 @@ def test_links_within_an_object_of_any_shape():
         holding = scene(star.tolist(), contacts, "x+", [0.0] * 5, joint=(1, -1), length=2, offset=(0.2, -0.2))
         near, z = mechanics(holding), np.append(rng.normal(size=2) * 2 + [0, 1], rng.uniform(0, np.pi, 3))
         turn = np.array([[np.cos(z[2]), np.sin(z[2])], [-np.sin(z[2]), np.cos(z[2])]])
-        outline = Path(np.asarray(body(holding.object).vertices)[:11] @ turn + z[:2])
+        outline = Path(np.asarray(rigid_body(holding.object).vertices)[:11] @ turn + z[:2])
         share, links = np.linspace(0, 1, 2001)[:, None], [np.linspace([-1, 0], [1, 0], 2001)]
         for x, theta in ((1, z[3]), (-1, z[4])):
             root = [x - 0.2 * np.sin(theta), 0.2 * np.cos(theta)]
             links.append(root + 2 * share * [np.cos(theta), np.sin(theta)])
         expected = bool(outline.contains_points(np.concatenate(links)).any())
-        pairs = frames(near.candidates, jnp.asarray(z) / near.configuration_unit)
-        assert bool(_pierced(near, pairs, 1e-10)) == expected
+        pairs = contact_kinematics(near.candidates, jnp.asarray(z) / near.configuration_unit)
+        assert bool(_link_penetrates_object(near, pairs, 1e-10)) == expected
         found.append(expected)
     assert 10 < sum(found) < 50
 
@@ -364,13 +364,13 @@ def test_links_within_an_object_of_any_shape():
 def test_too_few_steps_are_always_said():
     """A phase of several pieces that needs more steps than the record holds says `max_steps`, or is right."""
     table, seen = track([0.0, 1.0, 2.0, 99.0], [1.0, 1.0, 1.0], knots=9)
-    whole = move(table, seen, jnp.asarray(1.0), how=Integration(), speed=4.0)
+    whole = simulate_motion(table, seen, jnp.asarray(1.0), how=IntegratorOptions(), speed=4.0)
     needed = int(whole.count)
     assert needed > 9
-    short = jax.jit(move, static_argnames=("how", "speed"))
+    short = jax.jit(simulate_motion, static_argnames=("how", "speed"))
     said = []
     for most in (*range(3, needed - 3, 3), *range(needed - 3, needed + 2)):  # each size is a program
-        motion = short(table, seen, jnp.asarray(1.0), how=Integration(max_steps=most), speed=4.0)
+        motion = short(table, seen, jnp.asarray(1.0), how=IntegratorOptions(max_steps=most), speed=4.0)
         said.append(int(motion.status) == wa.Status.MAX_STEPS)
         if not said[-1]:
             assert float(motion.s[motion.count]) == pytest.approx(4.0, rel=1e-12)
@@ -383,8 +383,8 @@ def test_a_motion_may_stop_and_go_on_often():
     """Pushes and pauses, twelve of each: more stages than a phase usually has."""
     slide = wa.load("heptagon")
     table = wa.trace(slide)[0].table
-    push = np.asarray(hold(table, table.breaks[0], 0.0, 3.0).torque)
-    brake = np.asarray(hold(table, table.breaks[0], 0.0, -6.0).torque)
+    push = np.asarray(best_quasistatic_torque(table, table.breaks[0], 0.0, 3.0).torque)
+    brake = np.asarray(best_quasistatic_torque(table, table.breaks[0], 0.0, -6.0).torque)
     cycle = np.stack([push, push, brake, brake, brake, brake])
     ticks = np.array([0.0, 1.0, 1.0, 2.0, 2.0, 4.0]) / 4
     times = np.concatenate([(k + ticks) / 12 for k in range(12)])

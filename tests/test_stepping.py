@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.model.schedule import window
-from wholearm_jax.simulation.integrator import Integration, Stop, found, repeated, reversible
+from wholearm_jax.model.schedule import restrict_to_phase
+from wholearm_jax.simulation.integrator import IntegratorOptions, TerminalEvent, integrate_adaptive, replay_steps, integrate_with_replay_adjoint
 
 NEVER = -jnp.inf
 
@@ -20,16 +20,16 @@ def spring(share, y, row):
 
 def stop_at(past, longest=jnp.inf):
     """Stop where `s` falls below `past`; steps longer than `longest` may have been there."""
-    return Stop(lambda y: y[0] < past, lambda y, after, rates, width: width > longest)
+    return TerminalEvent(lambda y: y[0] < past, lambda y, after, rates, width: width > longest)
 
 
 def steps_of(knots, *, past=NEVER, longest=jnp.inf, **how):
     """Steps from 0 to 1 of a schedule with these knots, from `s = 1` at rest."""
     schedule = wa.torque(knots, np.zeros((len(knots), 2)))
-    seen, how = window(schedule, jnp.zeros(()), jnp.ones(())), Integration(**how)
+    seen, how = restrict_to_phase(schedule, jnp.zeros(()), jnp.ones(())), IntegratorOptions(**how)
     one = jnp.ones(())
     y = jnp.stack([one, 0 * one])
-    steps = jax.jit(lambda y: found(spring, seen, how, 0 * one, one, y, stop_at(past, longest), one))(y)
+    steps = jax.jit(lambda y: integrate_adaptive(spring, seen, how, 0 * one, one, y, stop_at(past, longest), one))(y)
     return steps, seen, how, y
 
 
@@ -81,10 +81,10 @@ def test_rates_at_the_ends_of_steps_are_the_field_s():
             jax.debug.callback(lambda *each: seen.append(each), y, after, *rates, width)
             return width < 0
 
-        schedule = window(wa.torque([0.0, 1.0], np.zeros((2, 2))), jnp.zeros(()), jnp.ones(()))
-        how, one = Integration(solver=solver, tolerance=1e-3), jnp.ones(())
-        stop = Stop(lambda y: y[0] < NEVER, between)
-        jax.block_until_ready(found(spring, schedule, how, 0 * one, one, jnp.stack([one, 0 * one]), stop, one))
+        schedule = restrict_to_phase(wa.torque([0.0, 1.0], np.zeros((2, 2))), jnp.zeros(()), jnp.ones(()))
+        how, one = IntegratorOptions(solver=solver, tolerance=1e-3), jnp.ones(())
+        stop = TerminalEvent(lambda y: y[0] < NEVER, between)
+        jax.block_until_ready(integrate_adaptive(spring, schedule, how, 0 * one, one, jnp.stack([one, 0 * one]), stop, one))
         assert len(seen) > 2
         for y, after, first, last, width in seen:
             np.testing.assert_allclose(first, width * spring(0, y, 0), rtol=1e-12, atol=1e-12)
@@ -103,10 +103,10 @@ MATRIX = np.array([[np.cos(3.0), np.sin(3.0) / 3], [-3 * np.sin(3.0), np.cos(3.0
 @pytest.mark.parametrize("adjoint", ["forward", "both"])
 def test_repeated_steps_are_those_found_and_have_derivatives(adjoint):
     steps, seen, how, y = steps_of([0.0, 0.4, 1.0], tolerance=1e-12)
-    how = Integration(tolerance=1e-12, adjoint=adjoint)
+    how = IntegratorOptions(tolerance=1e-12, adjoint=adjoint)
 
     def end(y):
-        again = repeated(spring, seen, how, jnp.zeros(()), jnp.ones(()), y, steps)
+        again = replay_steps(spring, seen, how, jnp.zeros(()), jnp.ones(()), y, steps)
         return again.y[steps.count - 1]
 
     np.testing.assert_array_equal(end(y), steps.y[steps.count - 1])
@@ -122,12 +122,12 @@ def spring_of(stiffness, seen):
 def test_steps_are_gone_back_over():
     """From their end to a state, a parameter and the time of their beginning; modes that it would get wrong raise."""
     steps, seen, _, y = steps_of([0.0, 0.4, 1.0], tolerance=1e-12)
-    how = Integration(tolerance=1e-12, adjoint="reverse")
+    how = IntegratorOptions(tolerance=1e-12, adjoint="reverse")
 
     def end(y, stiffness=9.0, begin=0.0):
         inputs = jnp.asarray(stiffness), seen, jnp.asarray(begin), y
         one = jnp.ones(())
-        found = reversible(inputs, spring_of, stop_at, how, one, -10 * one, one)
+        found = integrate_with_replay_adjoint(inputs, spring_of, stop_at, how, one, -10 * one, one)
         return found.y[found.count - 1]
 
     np.testing.assert_array_equal(end(y), steps.y[steps.count - 1])

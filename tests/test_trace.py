@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import combined, on_panel, powers
+from wholearm_jax.dynamics.path_dynamics import evaluate_dot, evaluate, locate_panel
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.model.contact_kinematics import gaps, normal_rows, slip_rows
-from wholearm_jax.model.mechanics import system
-from wholearm_jax.model.scene import body
-from wholearm_jax.phases.phase import ending, prepare
-from wholearm_jax.tracing.path import Resolution, _panels
+from wholearm_jax.model.contact_kinematics import gaps, normal_jacobian, tangential_jacobian
+from wholearm_jax.model.mechanics import scaled_mechanics
+from wholearm_jax.model.scene import rigid_body
+from wholearm_jax.phases.phase import describe_end, trace_phase
+from wholearm_jax.tracing.path import Resolution, _distribute_panels
 
 ENDS = {
     "heptagon": ("finger2:v4 is made", "palm:v0 is made"),
@@ -24,7 +24,7 @@ ENDS = {
 @pytest.fixture(scope="module", params=ENDS)
 def traced(request):
     scene = wa.load(request.param)
-    mechanics = [system(body(scene.object), scene.hand, scene.gravity, p.formation) for p in scene.phases]
+    mechanics = [scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, p.formation) for p in scene.phases]
     return request.param, scene, wa.trace(scene), mechanics
 
 
@@ -34,7 +34,7 @@ def test_starts_and_ends_touch(traced):
         wire = at.wire
         assert float(jnp.abs(gaps(formation.contacts, wire.start)).max()) <= 1e-13
         assert float(jnp.abs(gaps(formation.contacts, wire.end)).max()) <= 1e-12
-        assert ending(at, phase, scene.object.vertices.shape[0]) == end
+        assert describe_end(at, phase, scene.object.vertices.shape[0]) == end
         made = gaps(formation.candidates, wire.end)[wire.end_contact]
         assert abs(float(made)) <= 1e-10
 
@@ -53,11 +53,11 @@ def test_the_table_holds_the_wire_between_its_nodes(traced):
         assert float(table.error) < 1e-9
         for s in np.random.default_rng(1).uniform(0, float(table.length), 50):
             piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
-            panel, xi = powers(table, piece, jnp.asarray(s))
-            z = on_panel(table.configuration, panel, xi) / formation.configuration_unit
-            x = on_panel(table.velocity, panel, xi) / formation.configuration_unit
+            panel, xi = locate_panel(table, piece, jnp.asarray(s))
+            z = evaluate(table.configuration, panel, xi) / formation.configuration_unit
+            x = evaluate(table.velocity, panel, xi) / formation.configuration_unit
             assert float(jnp.abs(gaps(formation.contacts, z)).max()) < 1e-10
-            assert float(jnp.abs(normal_rows(formation.contacts, z) @ x).max()) < 1e-9
+            assert float(jnp.abs(normal_jacobian(formation.contacts, z) @ x).max()) < 1e-9
 
 
 def test_slips_vanish_where_pieces_meet(traced):
@@ -65,12 +65,12 @@ def test_slips_vanish_where_pieces_meet(traced):
     for at, formation in zip(wires, mechanics, strict=True):
         table, wire = at.table, at.wire
         for k in range(1, int(table.count)):
-            panel, xi = powers(table, jnp.asarray(k), table.breaks[k])
-            z = on_panel(table.configuration, panel, xi) / formation.configuration_unit
-            x = on_panel(table.velocity, panel, xi) / formation.configuration_unit
+            panel, xi = locate_panel(table, jnp.asarray(k), table.breaks[k])
+            z = evaluate(table.configuration, panel, xi) / formation.configuration_unit
+            x = evaluate(table.velocity, panel, xi) / formation.configuration_unit
             flipped = np.flatnonzero(np.asarray(wire.slip_sign[k] != wire.slip_sign[k - 1]))
             assert flipped.size > 0
-            slip = np.asarray(slip_rows(formation.contacts, z) @ x)
+            slip = np.asarray(tangential_jacobian(formation.contacts, z) @ x)
             assert np.abs(slip[flipped]).max() < 1e-10
     if name == "heptagon":
         assert int(wires[1].table.count) == 2, "the heptagon's flip reverses a slip"
@@ -86,9 +86,9 @@ def ending_at_its_kink(beyond):
     """The heptagon's flip alone, until `phi` is just beyond the place where a slip reverses, and that flip whole."""
     data = to_dict(wa.load("heptagon"))
     slide, flip = wa.trace(wa.load("heptagon"))
-    panel, xi = powers(flip.table, jnp.asarray(0), flip.table.breaks[1])
-    kink = on_panel(flip.table.configuration, panel, xi)
-    speed = on_panel(flip.table.velocity, panel, xi)
+    panel, xi = locate_panel(flip.table, jnp.asarray(0), flip.table.breaks[1])
+    kink = evaluate(flip.table.configuration, panel, xi)
+    speed = evaluate(flip.table.velocity, panel, xi)
     data["start"] = dict(zip(data["start"], slide.end.tolist(), strict=True))
     data["phase"] = [data["phase"][1] | {"until": {"phi": float(kink[2] + beyond * jnp.sign(speed[2]))}}]
     return wa.parse(data), flip
@@ -114,8 +114,8 @@ def test_until_ends_a_phase_early():
 
 def test_the_other_way_along_the_wire():
     ahead, back = wa.trace(changed("heptagon"))[0], wa.trace(changed("heptagon", toward="x+"))[0]
-    panel, xi = powers(ahead.table, jnp.asarray(0), ahead.table.breaks[0])
-    start = float(on_panel(ahead.table.configuration, panel, xi)[0])
+    panel, xi = locate_panel(ahead.table, jnp.asarray(0), ahead.table.breaks[0])
+    start = float(evaluate(ahead.table.configuration, panel, xi)[0])
     assert float(ahead.end[0]) < start - 0.01
     assert float(back.end[0]) > start + 0.001
 
@@ -155,8 +155,8 @@ def test_a_wire_passes_the_turning_point_of_theta1():
     table, wire = at.table, at.wire
     assert int(table.status) == wa.Status.OK
     np.testing.assert_array_equal(wire.joint_sign[:2, 0], [-1.0, 1.0])
-    panel, xi = powers(table, jnp.asarray(1), table.breaks[1])
-    assert abs(float(on_panel(table.velocity, panel, xi)[3])) < 1e-10
+    panel, xi = locate_panel(table, jnp.asarray(1), table.breaks[1])
+    assert abs(float(evaluate(table.velocity, panel, xi)[3])) < 1e-10
     assert float(table.breaks[1]) < float(table.length) - 1e-3
 
 
@@ -182,7 +182,7 @@ def test_a_vertex_leaves_the_palm_where_it_ends(toward, contact, x):
     )
     (traced,) = wa.trace(scene)
     assert int(traced.table.status) == wa.Status.OK
-    assert ending(traced, scene.phases[0], 8) == f"{contact} leaves its feature"
+    assert describe_end(traced, scene.phases[0], 8) == f"{contact} leaves its feature"
     z = np.asarray(traced.end)
     np.testing.assert_allclose(z[:3], [x, 0.03, 0.0], atol=1e-12)
 
@@ -196,7 +196,7 @@ def test_combined_functions_have_the_derivatives_of_a_sum_of_products():
         return (coefficients[panel] * xi ** jnp.arange(8)[:, None, None]).sum(0) @ terms
 
     def ours(coefficients, xi, terms):
-        return combined(coefficients, panel, xi, terms)
+        return evaluate_dot(coefficients, panel, xi, terms)
 
     given = jnp.asarray(coefficients), jnp.asarray(0.3), jnp.asarray(terms)
     np.testing.assert_allclose(ours(*given), plain(*given), rtol=1e-13)
@@ -213,9 +213,9 @@ def at_places(table, shares):
 
     def one(s):
         piece = jnp.minimum((s >= table.breaks[1:-1]).sum(), table.count - 1)
-        panel, xi = powers(table, piece, s)
+        panel, xi = locate_panel(table, piece, s)
         names = ("acceleration", "backward", "force", "configuration", "velocity")
-        return [on_panel(getattr(table, name), panel, xi) for name in names]
+        return [evaluate(getattr(table, name), panel, xi) for name in names]
 
     return jax.vmap(one)(table.breaks[0] + shares * table.length)
 
@@ -244,7 +244,7 @@ def traced_with(scene, phase, panels):
     """One phase's table, not refined."""
     told, rough = scene.phases[phase], scene.start if phase == 0 else wa.trace(scene)[0].end
     resolution = Resolution(panels=panels)
-    return prepare(body(scene.object), scene.hand, scene.gravity, told.formation, rough, told.heading, resolution).table
+    return trace_phase(rigid_body(scene.object), scene.hand, scene.gravity, told.formation, rough, told.heading, resolution).table
 
 
 @pytest.mark.parametrize(
@@ -254,7 +254,7 @@ def test_panels_go_where_the_wire_is_long(lengths, panels):
     """At least one to each piece that is used; what rounding leaves over goes to the longest."""
     pieces, count = 4, len(lengths)
     breaks = jnp.pad(jnp.cumsum(jnp.asarray([0.0, *lengths])), (0, pieces - count), mode="edge")
-    first, shared, owner = _panels(breaks, count, Resolution(pieces, panels=4))
+    first, shared, owner = _distribute_panels(breaks, count, Resolution(pieces, panels=4))
     assert shared[:count].tolist() == panels
     assert shared[count:].tolist() == [0] * (pieces - count)
     assert first[:count].tolist() == np.cumsum([0, *panels])[:-1].tolist()

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import Change
-from wholearm_jax.margin.contact_forces import Score
-from wholearm_jax.phases.assessment import ARRIVAL, BRAKING, GOALS, PULL, judge
+from wholearm_jax.dynamics.path_dynamics import Impact
+from wholearm_jax.margin.contact_forces import MarginResult
+from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL, ARRIVAL_SPEED_FACTOR, GOALS, IMPULSE_ROUNDING, assess_phase
 from wholearm_jax.simulation.phase_motion import Motion
 
 S = wa.Status
-CALM = Change(speed=jnp.asarray(0.0), impulse=jnp.zeros(4), size=jnp.asarray(1.0))
+CALM = Impact(speed=jnp.asarray(0.0), impulse=jnp.zeros(4), size=jnp.asarray(1.0))
 EDGE = 1e-3  # how far from an edge the cases stand, relatively
 
 
@@ -44,11 +44,11 @@ def moved(table, ended, short=0.0, speed=0.0, share=1.0, rests=None):
 
 def scored(lost=np.inf, contact=-1):
     numbers = {"margin": 1.0, "share": 0.5, "s": 0.0, "contact": 0, "lost": lost, "lost_contact": contact}
-    return Score(**{name: jnp.asarray(value) for name, value in numbers.items()})
+    return MarginResult(**{name: jnp.asarray(value) for name, value in numbers.items()})
 
 
-def judged(table, motion, goal="rest", score=None, entered=CALM, arrival=ARRIVAL):
-    found = judge(table, motion, score or scored(), jnp.asarray(GOALS[goal]), entered, arrival)
+def judged(table, motion, goal="rest", score=None, entered=CALM, arrival=DEFAULT_ARRIVAL):
+    found = assess_phase(table, motion, score or scored(), jnp.asarray(GOALS[goal]), entered, arrival)
     return S(int(found.status)), float(found.share), int(found.contact)
 
 
@@ -58,11 +58,11 @@ def judged(table, motion, goal="rest", score=None, entered=CALM, arrival=ARRIVAL
 def test_at_rest_at_the_end_means_near_and_slow(table, ended, near, slow, arrival):
     """The speed left is at most what braking at 6 lengths a duration squared ends within the share of the wire."""
     short = arrival * (1 - EDGE if near else 1 + EDGE)
-    speed = np.sqrt(BRAKING * arrival) * (1 - EDGE if slow else 1 + EDGE)
+    speed = np.sqrt(ARRIVAL_SPEED_FACTOR * arrival) * (1 - EDGE if slow else 1 + EDGE)
     status, share, contact = judged(table, moved(table, ended, short, speed), arrival=arrival)
     failed = S.NOT_REACHED if ended is S.OK else ended
     assert (status, share, contact) == (S.OK if near and slow else failed, 1.0, -1)
-    assert np.sqrt(BRAKING * arrival) == pytest.approx(np.sqrt(2 * 6 * arrival))
+    assert np.sqrt(ARRIVAL_SPEED_FACTOR * arrival) == pytest.approx(np.sqrt(2 * 6 * arrival))
 
 
 @pytest.mark.parametrize("goal", ["moving", "caught"])
@@ -83,7 +83,7 @@ def test_what_stands_near_the_end_has_arrived(table):
 
 def test_what_turns_back_has_arrived_if_it_was_late(table):
     """As late as the speed it may have had would have taken it there."""
-    allowed = np.sqrt(BRAKING * ARRIVAL)
+    allowed = np.sqrt(ARRIVAL_SPEED_FACTOR * DEFAULT_ARRIVAL)
     late, early = (moved(table, S.REVERSED, share=1 - allowed * (1 + side * EDGE)) for side in (-1, 1))
     assert judged(table, late)[0] is S.OK
     assert judged(table, early)[0] is S.REVERSED
@@ -113,8 +113,8 @@ SIZE = 3.0
 GOOD = [1.0, 2.0, 0.5, 0.1]
 IMPULSES = {
     "none pulls": (0.1, GOOD, None),
-    "one is zero but for rounding": (0.1, [1.0, 2.0, 0.5, -PULL * SIZE * (1 - EDGE)], None),
-    "one pulls": (0.1, [1.0, -PULL * SIZE * (1 + EDGE), 0.5, 0.1], (S.CONTACT_LOST, 0.0, 1)),
+    "one is zero but for rounding": (0.1, [1.0, 2.0, 0.5, -IMPULSE_ROUNDING * SIZE * (1 - EDGE)], None),
+    "one pulls": (0.1, [1.0, -IMPULSE_ROUNDING * SIZE * (1 + EDGE), 0.5, 0.1], (S.CONTACT_LOST, 0.0, 1)),
     "the one that pulls most is named": (0.1, [1.0, -0.1, -0.3, 0.1], (S.CONTACT_LOST, 0.0, 2)),
     "thrown back": (-1e-12, GOOD, (S.REVERSED, 0.0, -1)),
     "thrown back, and one pulls": (-0.1, [1.0, 2.0, 0.5, -0.1], (S.CONTACT_LOST, 0.0, 3)),
@@ -125,7 +125,7 @@ IMPULSES = {
 @pytest.mark.parametrize("tensile", [False, True], ids=["", "tensile later"])
 def test_impacts_that_are_refused(table, tensile, speed, impulse, expected):
     """Before anything that happens later, and at the phase's beginning."""
-    entered = Change(jnp.asarray(speed), jnp.asarray(impulse), jnp.asarray(SIZE))
+    entered = Impact(jnp.asarray(speed), jnp.asarray(impulse), jnp.asarray(SIZE))
     score = scored(0.4, 0) if tensile else scored()
     otherwise = (S.CONTACT_LOST, 0.4, 0) if tensile else (S.OK, 1.0, -1)
     assert judged(table, moved(table, S.OK), score=score, entered=entered) == (expected or otherwise)
@@ -133,5 +133,5 @@ def test_impacts_that_are_refused(table, tensile, speed, impulse, expected):
 
 def test_a_wire_that_cannot_be_traced_counts_before_all(table):
     untraced = eqx.tree_at(lambda t: t.status, table, jnp.asarray(int(S.NO_CONVERGENCE), table.status.dtype))
-    pulled = Change(jnp.asarray(-1.0), -jnp.ones(4), jnp.asarray(1.0))
+    pulled = Impact(jnp.asarray(-1.0), -jnp.ones(4), jnp.asarray(1.0))
     assert judged(untraced, moved(table, S.OK), score=scored(0.4, 2), entered=pulled) == (S.NO_CONVERGENCE, 0.0, -1)

@@ -17,11 +17,11 @@ from wholearm_jax.cli.arguments import (
     BadInput,
     SceneName,
     TorqueFile,
-    descending,
-    made_folder,
+    descent_progress,
+    make_output_folder,
     phase_number,
-    predicted,
-    scene_of,
+    simulate_prediction,
+    load_scene,
     traced_or_refused,
     writing,
 )
@@ -30,7 +30,7 @@ from wholearm_jax.cli.execute import execute
 from wholearm_jax.cli.output import finish, write_report
 from wholearm_jax.cli.robust import optimise_robustly
 from wholearm_jax.core.config import configure
-from wholearm_jax.core.programs import keep
+from wholearm_jax.core.programs import keep_programs
 
 UsageError: Any = typer.BadParameter.__mro__[1]  # of the library beneath, which Typer has under changing names
 
@@ -79,7 +79,7 @@ def _keep_compiled() -> None:
     folder = os.path.join(home, "wholearm_jax")
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
-    keep(Path(folder, "programs"))
+    keep_programs(Path(folder, "programs"))
 
 
 @app.command()
@@ -117,8 +117,8 @@ def optimise(
     """Find the torques with the largest compressive margin, and check them by simulation."""
     if report and out is None:
         raise BadInput("--report: needs a folder to write to: add --out DIR")
-    loaded = scene_of(scene, set_)
-    folder = made_folder(out)
+    loaded = load_scene(scene, set_)
+    folder = make_output_folder(out)
     if robust:
         others = (("rate-limit", rate_limit), ("passing", passing))
         unknown = [name for name, value in others if value is not None]
@@ -126,13 +126,13 @@ def optimise(
             raise BadInput(f"--robust: knows no --{unknown[0]}")
         optimise_robustly(ensemble(loaded, robust, seed), folder, samples or 64, knots, steps, arrival, report)
     samples = samples or 201
-    from wholearm_jax.optimisation.optimiser import PASSING, optimise_beside
+    from wholearm_jax.optimisation.optimiser import MIN_TRANSITION_SPEED, precompile_optimise
     from wholearm_jax.optimisation.optimiser import optimise as find
 
     begun = time.perf_counter()
-    optimise_beside(loaded, knots=knots)
+    precompile_optimise(loaded, knots=knots)
     traced = traced_or_refused(scene, loaded)
-    with descending() as progress:
+    with descent_progress() as progress:
         bars = [progress.add_task(p.name, total=steps, state="waiting") for p in loaded.phases]
 
         def show(step):
@@ -140,7 +140,7 @@ def optimise(
             progress.update(bars[step.phase], completed=step.step + 1, state=state)
 
         progress.update(bars[0], state="compiling")
-        passing = PASSING if passing is None else passing
+        passing = MIN_TRANSITION_SPEED if passing is None else passing
         options = {"knots": knots, "steps": steps, "rate_limit": rate_limit, "passing": passing}
         found = find(loaded, **options, callback=show, traced=traced)
         for bar, why in zip(bars, found.stopped, strict=True):
@@ -169,18 +169,18 @@ def simulate(
     ] = False,
 ) -> None:
     """Simulate a plan under a given torque schedule."""
-    loaded = scene_of(scene, set_)
-    from wholearm_jax.core.programs import wait
+    loaded = load_scene(scene, set_)
+    from wholearm_jax.core.programs import wait_for
     from wholearm_jax.files.results import read_torque
     from wholearm_jax.optimisation.optimiser import bounds
-    from wholearm_jax.phases.plan import simulate_beside
+    from wholearm_jax.phases.plan import precompile_simulate
 
     schedule = read_torque(torque)
-    folder = made_folder(out)
-    compiled = simulate_beside(loaded, schedule, tolerance)
+    folder = make_output_folder(out)
+    compiled = precompile_simulate(loaded, schedule, tolerance)
     traced = traced_or_refused(scene, loaded)
-    wait(compiled)
-    result = predicted(loaded, schedule, torque, tolerance, traced)
+    wait_for(compiled)
+    result = simulate_prediction(loaded, schedule, torque, tolerance, traced)
     _tell(result)
     if check_gradient:
         _check_gradient(loaded, schedule)
@@ -231,13 +231,13 @@ def formations(
     ] = None,
 ) -> None:
     """List the formations of four contacts that hold at a configuration, and where their wires lead."""
-    loaded = scene_of(scene, None)
-    folder = made_folder(out)
+    loaded = load_scene(scene, None)
+    folder = make_output_folder(out)
     from rich.console import Console
     from rich.table import Table
 
-    from wholearm_jax.phases.phase import destination
-    from wholearm_jax.planning.successors import leaving, touching, ways
+    from wholearm_jax.phases.phase import target_configuration
+    from wholearm_jax.planning.successors import exit_velocity, touching_contacts, successor_formations
 
     traced = traced_or_refused(scene, loaded)
     if after is None:
@@ -247,10 +247,10 @@ def formations(
         if row is None:
             names = ", ".join(p.name for p in loaded.phases)
             raise BadInput(f"--after {after}: no such phase; phases: {names}")
-        z = destination(loaded.phases[row], traced[row])
-        z_dot = None if loaded.phases[row].arrive == "hold" else leaving(traced[row].table)
-    found = ways(loaded, z, z_dot)
-    table = Table(title=f"touching: {', '.join(touching(loaded, z))}")
+        z = target_configuration(loaded.phases[row], traced[row])
+        z_dot = None if loaded.phases[row].arrive == "hold" else exit_velocity(traced[row].table)
+    found = successor_formations(loaded, z, z_dot)
+    table = Table(title=f"touching: {', '.join(touching_contacts(loaded, z))}")
     for column in ("contacts", "toward", "leads to", "length", "static N", "bound N", "enter at speed"):
         table.add_column(column, justify="left" if column in ("contacts", "toward", "leads to") else "right")
     for way in found:
@@ -260,24 +260,24 @@ def formations(
     Console().print(table)
     print(LEGEND)
     if folder is not None:
-        from wholearm_jax.plotting.plan_figures import draw_ways, save_figure
+        from wholearm_jax.plotting.plan_figures import draw_successors, save_figure
 
-        save_figure(lambda: draw_ways(loaded, z, found), folder, "formations")
+        save_figure(lambda: draw_successors(loaded, z, found), folder, "formations")
 
 
 @app.command()
 def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
     """The paper's search for torques by steps of 10 %."""
-    loaded = scene_of(scene, None)
-    folder = made_folder(out)
-    from wholearm_jax.core.programs import wait
+    loaded = load_scene(scene, None)
+    folder = make_output_folder(out)
+    from wholearm_jax.core.programs import wait_for
     from wholearm_jax.optimisation.optimiser import bounds
-    from wholearm_jax.optimisation.step_search import search as look
-    from wholearm_jax.optimisation.step_search import search_beside
+    from wholearm_jax.optimisation.step_search import search_by_steps as look
+    from wholearm_jax.optimisation.step_search import precompile_search
 
-    compiled = search_beside()
+    compiled = precompile_search()
     traced = traced_or_refused(scene, loaded)
-    wait(compiled)
+    wait_for(compiled)
     try:
         found = look(loaded, traced=traced)
     except ValueError as error:

@@ -21,7 +21,7 @@ class BadInput(Exception):
     """What the user gave cannot be used; the message is one line."""
 
 
-def scene_of(name: str, changes: list[str] | None):
+def load_scene(name: str, changes: list[str] | None):
     """Load a scene and apply `--set`."""
     from wholearm_jax.files.scene_toml import load
 
@@ -31,7 +31,7 @@ def scene_of(name: str, changes: list[str] | None):
     return scene
 
 
-def counting(told: str):
+def counting_progress(told: str):
     """A progress bar on the terminal that counts, with its task's field in the text `told` and the time left."""
     from rich.progress import TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -40,7 +40,7 @@ def counting(told: str):
     )
 
 
-def descending():
+def descent_progress():
     """A progress bar on the terminal for each descent, with its task's field `state`: the time left is not known."""
     from rich.progress import TextColumn, TimeElapsedColumn
 
@@ -87,17 +87,17 @@ def traced_or_refused(name: str, scene):
     """Trace a plan; refuse it, naming the contact, where a formation's contacts cannot all touch where it begins."""
     import numpy as np
 
-    from wholearm_jax.model.contact_kinematics import constraints, frames, placed
-    from wholearm_jax.model.mechanics import system
-    from wholearm_jax.model.scene import body
-    from wholearm_jax.phases.phase import destination
+    from wholearm_jax.model.contact_kinematics import constraints, contact_kinematics, anchor_rolling
+    from wholearm_jax.model.mechanics import scaled_mechanics
+    from wholearm_jax.model.scene import rigid_body
+    from wholearm_jax.phases.phase import target_configuration
     from wholearm_jax.phases.plan import trace
 
     @jax.jit
     def apart(formation, z, rough):
-        mechanics = system(body(scene.object), scene.hand, scene.gravity, formation)
-        held = placed(mechanics.contacts, rough / mechanics.configuration_unit)
-        at, missed = frames(held, z), jax.numpy.abs(constraints(held, z))
+        mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, formation)
+        held = anchor_rolling(mechanics.contacts, rough / mechanics.configuration_unit)
+        at, missed = contact_kinematics(held, z), jax.numpy.abs(constraints(held, z))
         beyond = jax.numpy.maximum(0.0, jax.numpy.maximum(held.lower - at.along, at.along - held.upper))
         gap = jax.numpy.where(held.tangential, missed, jax.numpy.hypot(at.gap, beyond))
         return gap, mechanics.length, mechanics.configuration_unit
@@ -106,7 +106,7 @@ def traced_or_refused(name: str, scene):
     for k, (phase, at) in enumerate(zip(scene.phases, traced, strict=True)):
         if int(at.table.status) == 0:
             continue
-        rough = destination(scene.phases[k - 1], traced[k - 1]) if k > 0 else scene.start
+        rough = target_configuration(scene.phases[k - 1], traced[k - 1]) if k > 0 else scene.start
         gap, length, unit = apart(phase.formation, at.wire.start, rough)
         where = "with the others, from this start"
         if k > 0 and not np.any(gap > 1e-6):
@@ -142,19 +142,19 @@ def note(text: str) -> None:
     print(f"wholearm: note: {text}", file=sys.stderr)
 
 
-def note_limits(scene, schedule, torque: Path) -> None:
+def note_limit_violations(scene, schedule, torque: Path) -> None:
     """Say where a schedule asks for more than a joint's torque limit."""
-    from wholearm_jax.model.schedule import beyond
+    from wholearm_jax.model.schedule import limit_violations
 
-    for joint, size, when, limit in beyond(schedule, scene.hand.torque_limit):
+    for joint, size, when, limit in limit_violations(schedule, scene.hand.torque_limit):
         note(f"{torque}: |tau{joint}| is {size:.4g} N m at t = {when:.4g} s, beyond the limit of {limit:.4g} N m")
 
 
-def predicted(scene, schedule, torque: Path, tolerance: float, traced):
+def simulate_prediction(scene, schedule, torque: Path, tolerance: float, traced):
     """Simulate a plan under a schedule; refuse one from the file `torque` that is too short."""
     from wholearm_jax.phases.plan import simulate as follow
 
-    note_limits(scene, schedule, torque)
+    note_limit_violations(scene, schedule, torque)
     try:
         return follow(scene, schedule, tolerance=tolerance, traced=traced)
     except ValueError as error:
@@ -170,7 +170,7 @@ def writing(where: str):
         raise BadInput(f"{where}: cannot be written: {error.strerror or error}") from None
 
 
-def made_folder(out: Path | None) -> Path | None:
+def make_output_folder(out: Path | None) -> Path | None:
     """Make the output folder now, so that a long computation is not lost to a folder that cannot be written."""
     if out is None:
         return None

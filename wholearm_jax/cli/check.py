@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import typer
 
-from wholearm_jax.cli.arguments import TORQUE, BadInput, SceneName, counting, note, note_limits, writing
+from wholearm_jax.cli.arguments import TORQUE, BadInput, SceneName, counting_progress, note, note_limit_violations, writing
 from wholearm_jax.core.config import configure
 
 BESIDE = (".json", ".png", ".svg", ".pdf")  # what stands beside a store, under its name
@@ -144,17 +144,17 @@ def _followed(scene, torque: Path, place: _Place):
     except ValueError as error:
         raise BadInput(f"{torque}: {error}") from None
     if place.first:
-        note_limits(scene, schedule, torque)
+        note_limit_violations(scene, schedule, torque)
     return schedule
 
 
 def ensemble(scene, amounts: list[str] | None, seed: int):
     """The ensemble that `QUANTITY=AMOUNT` arguments describe."""
-    from wholearm_jax.ensembles.ensemble import vary
+    from wholearm_jax.ensembles.ensemble import make_ensemble
 
     pairs = [text.partition("=") for text in amounts or ()]
     try:
-        return vary(scene, {name.strip(): amount.strip() for name, _, amount in pairs}, seed=seed)
+        return make_ensemble(scene, {name.strip(): amount.strip() for name, _, amount in pairs}, seed=seed)
     except ValueError as error:
         raise BadInput(f"{error}") from None
 
@@ -204,7 +204,7 @@ def _fill(store, job: _Job, place: _Place) -> None:
     missing = [k for k in range(place.number, store.chunks, place.count) if not done[k]]
     if not missing:
         return
-    with counting("{task.fields[rate]}") as progress:
+    with counting_progress("{task.fields[rate]}") as progress:
         total = sum(min(store.chunk, store.count - k * store.chunk) for k in missing)
         bar, begun, written = progress.add_task("scenes", total=total, rate="compiling"), None, 0
         for number, values in _optimised(job, missing) if job.optimise else _checked(job, missing):
@@ -217,10 +217,10 @@ def _fill(store, job: _Job, place: _Place) -> None:
 
 
 def _checked(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
-    from wholearm_jax.ensembles.batch import check_chunks
+    from wholearm_jax.ensembles.batch import check_in_chunks
 
     settings = {"tolerance": job.settings["tolerance"], "arrival": job.settings["arrival"]}
-    parts = check_chunks(job.source, job.torque, job.count, chunk=job.chunk, wanted=missing, **settings)
+    parts = check_in_chunks(job.source, job.torque, job.count, chunk=job.chunk, wanted=missing, **settings)
     for number, part in parts:
         yield number, part._asdict()
 
@@ -232,7 +232,7 @@ def _optimised(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
     import jax
     import numpy as np
 
-    from wholearm_jax.ensembles.batch import Checked, from_result
+    from wholearm_jax.ensembles.batch import BatchResult, from_result
     from wholearm_jax.optimisation.optimiser import optimise
 
     def one(number):
@@ -245,7 +245,7 @@ def _optimised(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
             rows = range(number * job.chunk, min(job.count, (number + 1) * job.chunk))
             results, schedules = zip(*pool.map(one, rows), strict=True)
             columns = [np.stack([np.asarray(value) for value in column]) for column in zip(*results, strict=True)]
-            yield number, {**Checked(*columns)._asdict(), "torque": np.stack(schedules)}
+            yield number, {**BatchResult(*columns)._asdict(), "torque": np.stack(schedules)}
 
 
 def _report(store, scene, source, out: Path):
@@ -255,21 +255,21 @@ def _report(store, scene, source, out: Path):
     import jax
     import numpy as np
 
-    from wholearm_jax.core.atomic_files import write_whole
+    from wholearm_jax.core.atomic_files import write_atomically
     from wholearm_jax.ensembles.ensemble import Ensemble
-    from wholearm_jax.ensembles.summary import influences, most_influential, survey
-    from wholearm_jax.plotting.ensemble_figures import draw_survey
+    from wholearm_jax.ensembles.summary import rank_correlations, most_influential, summarise
+    from wholearm_jax.plotting.ensemble_figures import draw_ensemble
     from wholearm_jax.plotting.plan_figures import save_figure
 
-    told = survey(scene, (store.read(k) for k in range(store.chunks)), store.count)
+    told = summarise(scene, (store.read(k) for k in range(store.chunks)), store.count)
     shown, more = (), {}
     if isinstance(source, Ensemble) and source.parameters:
         shifts = np.asarray(jax.lax.map(source.shifts, told.numbers, batch_size=1024))
-        influence = influences(told.margins, shifts)
+        influence = rank_correlations(told.margins, shifts)
         shown = tuple((source.parameters[k], shifts[:, k]) for k in most_influential(source.parameters, influence))
         pairs = zip(source.parameters, influence.tolist(), strict=True)
         more = {"influence": {name: rank for name, rank in pairs if rank}}
     with writing(str(out)):
-        write_whole(out.with_suffix(".json"), json.dumps(told.as_dict() | more, indent=1) + "\n")
-        save_figure(lambda: draw_survey(told, more.get("influence"), shown), out.parent, out.stem)
+        write_atomically(out.with_suffix(".json"), json.dumps(told.as_dict() | more, indent=1) + "\n")
+        save_figure(lambda: draw_ensemble(told, more.get("influence"), shown), out.parent, out.stem)
     return told

@@ -13,10 +13,10 @@ from wholearm_jax.cli.arguments import (
     BadInput,
     SceneName,
     TorqueFile,
-    counting,
-    made_folder,
-    predicted,
-    scene_of,
+    counting_progress,
+    make_output_folder,
+    simulate_prediction,
+    load_scene,
     traced_or_refused,
     writing,
 )
@@ -41,12 +41,12 @@ def execute(
     if video and out is None:
         raise BadInput("--video: needs a folder to write to: add --out DIR")
     shares = _share("--friction", friction), _share("--mass", mass)
-    loaded = scene_of(scene, None)
+    loaded = load_scene(scene, None)
     try:
-        from wholearm_jax.execution.rollout import Ending, Tolerance, require_wires
+        from wholearm_jax.execution.rollout import ExecutionOutcome, Tolerance, require_wires
         from wholearm_jax.execution.rollout import execute as drive
         from wholearm_jax.execution.trials import Amounts, require_objects
-        from wholearm_jax.execution.trials import perturb as drive_perturbed
+        from wholearm_jax.execution.trials import run_trials as drive_perturbed
     except ModuleNotFoundError as error:
         if error.name not in ("mujoco", "joblib"):
             raise
@@ -59,8 +59,8 @@ def execute(
             require_objects(loaded, amounts)
         except ValueError as error:
             raise BadInput(f"--{error}") from None
-    folder = made_folder(out)
-    prediction = predicted(loaded, schedule, torque, 1e-10, traced_or_refused(scene, loaded))
+    folder = make_output_folder(out)
+    prediction = simulate_prediction(loaded, schedule, torque, 1e-10, traced_or_refused(scene, loaded))
     within = Tolerance(position, angle)
     print(f"predicted: {prediction.message}")
     try:
@@ -80,7 +80,7 @@ def execute(
     if folder is not None:
         _write_execution(done, many, torque, folder, video)
     print(f"executed: {done.message}" + (f" -> {folder}" if folder else ""))
-    sys.exit(0 if done.ending is Ending.OK else 1)
+    sys.exit(0 if done.ending is ExecutionOutcome.OK else 1)
 
 
 def _share(option: str, text: str) -> float:
@@ -97,14 +97,14 @@ def _share(option: str, text: str) -> float:
 @contextmanager
 def _progress(count: int) -> Iterator[Callable]:
     """A bar on the terminal while perturbed executions run, to be called with each that is done."""
-    from wholearm_jax.execution.rollout import Ending
+    from wholearm_jax.execution.rollout import ExecutionOutcome
 
-    with counting("{task.fields[succeed]} succeed") as progress:
+    with counting_progress("{task.fields[succeed]} succeed") as progress:
         bar, succeed = progress.add_task("perturbed executions", total=count, succeed=0), 0
 
         def told(run) -> None:
             nonlocal succeed
-            succeed += run.ending is Ending.OK
+            succeed += run.ending is ExecutionOutcome.OK
             progress.update(bar, advance=1, succeed=succeed)
 
         yield told
@@ -112,21 +112,21 @@ def _progress(count: int) -> Iterator[Callable]:
 
 def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> None:
     """Write an execution's files."""
-    from wholearm_jax.core.atomic_files import write_whole
+    from wholearm_jax.core.atomic_files import write_atomically
     from wholearm_jax.files.results import discard_execution, execution_summary, write_execution, write_summary
 
     with writing(f"--out {folder}"):
         discard_execution(folder)
         write_summary(execution_summary(done, many, torque=str(torque)), folder / "execution.json")
         write_execution(done, folder / "execution.csv")
-        write_whole(folder / "model.xml", done.model_xml)
+        write_atomically(folder / "model.xml", done.model_xml)
         _draw_execution(done, folder, video)
 
 
 def _draw_execution(done, folder: Path, video: bool) -> None:
     import matplotlib.pyplot as plt
 
-    from wholearm_jax.core.atomic_files import write_whole
+    from wholearm_jax.core.atomic_files import write_atomically
     from wholearm_jax.plotting.execution_figures import animate, draw_execution, draw_execution_strip
     from wholearm_jax.plotting.plan_figures import save_figure
 
@@ -136,5 +136,5 @@ def _draw_execution(done, folder: Path, video: bool) -> None:
         with tempfile.TemporaryDirectory() as elsewhere:
             drawn = Path(elsewhere, "execution.gif")
             animate(done).save(drawn, writer="pillow")  # which needs no further program
-            write_whole(folder / "execution.gif", drawn.read_bytes())
+            write_atomically(folder / "execution.gif", drawn.read_bytes())
         plt.close("all")

@@ -31,10 +31,10 @@ def write_result(result, folder: Path | None, samples: int, report: bool = False
 
 def write_report(folder: Path, path: Path) -> None:
     """Write a result folder's page."""
-    from wholearm_jax.core.atomic_files import write_whole
+    from wholearm_jax.core.atomic_files import write_atomically
     from wholearm_jax.report.page import report as page
 
-    write_whole(path, page(folder))
+    write_atomically(path, page(folder))
 
 
 def _draw(result, folder: Path) -> None:

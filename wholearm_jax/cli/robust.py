@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from wholearm_jax.cli.arguments import BadInput, descending
+from wholearm_jax.cli.arguments import BadInput, descent_progress
 from wholearm_jax.cli.output import write_result
 
 
@@ -19,7 +19,7 @@ def optimise_robustly(
         require_motion(varied.scene)
     except ValueError as error:
         raise BadInput(f"--robust: {error}") from None
-    with descending() as progress:
+    with descent_progress() as progress:
         bar = progress.add_task("robust", total=steps + 1, state="the nominal schedule")
 
         def show(step, held):

@@ -5,7 +5,7 @@ import uuid
 from pathlib import Path
 
 
-def write_whole(path: str | Path, content: str | bytes) -> None:
+def write_atomically(path: str | Path, content: str | bytes) -> None:
     """Write a file beside its place and move it there once it is complete.
 
     A file that is replaced passes on its permissions, a new one has those that the process gives; behind a symbolic

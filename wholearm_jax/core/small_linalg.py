@@ -14,16 +14,16 @@ from jaxtyping import Array, Float
 
 
 @jax.jit
-def inverse(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
+def inverse_and_determinant(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
     """`A^-1` and `det A`. Of a singular matrix the first is not finite and the second 0.
 
     Derivatives: `d(A^-1) = -A^-1 dA A^-1` and `d(det A) = det A tr(A^-1 dA)`.
     """
-    return _eliminated(matrix)
+    return _gauss_jordan(matrix)
 
 
 @jax.custom_jvp
-def _eliminated(matrix):
+def _gauss_jordan(matrix):
     n = matrix.shape[0]
     rows = jnp.arange(n)
 
@@ -45,15 +45,15 @@ def _eliminated(matrix):
     return wide[:, n:], determinant
 
 
-@_eliminated.defjvp
-def _rate(primals, tangents):
+@_gauss_jordan.defjvp
+def _gauss_jordan_jvp(primals, tangents):
     (matrix,), (rate,) = primals, tangents
-    inverted, determinant = _eliminated(matrix)
-    relative = times(inverted, rate)
-    return (inverted, determinant), (-times(relative, inverted), determinant * jnp.trace(relative))
+    inverted, determinant = _gauss_jordan(matrix)
+    relative = fused_matmul(inverted, rate)
+    return (inverted, determinant), (-fused_matmul(relative, inverted), determinant * jnp.trace(relative))
 
 
-def crossed(rows: Float[Array, "4 5"]) -> Float[Array, "5"]:
+def null_vector(rows: Float[Array, "4 5"]) -> Float[Array, "5"]:
     """What is orthogonal to four rows: its product with any other row is the determinant of all five.
 
     Each component is a determinant of four columns, by products of minors of the first and the last two rows (Laplace):
@@ -79,7 +79,7 @@ def _laplace() -> tuple[np.ndarray, ...]:
 _PAIRS, _UPPER, _LOWER, _SIGNS = _laplace()
 
 
-def times(matrix: Float[Array, "m n"], right: Float[Array, "n *columns"]) -> Float[Array, "m *columns"]:
+def fused_matmul(matrix: Float[Array, "m n"], right: Float[Array, "n *columns"]) -> Float[Array, "m *columns"]:
     """The product with a vector or a matrix, as a sum of products, which is fused with what is about it: a call of a
     library for matrices would take longer to prepare than it computes."""
     if right.ndim == 1:
@@ -89,4 +89,4 @@ def times(matrix: Float[Array, "m n"], right: Float[Array, "n *columns"]) -> Flo
 
 def solve(matrix: Float[Array, "n n"], right: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
     """`A^-1 b`."""
-    return times(inverse(matrix)[0], right)
+    return fused_matmul(inverse_and_determinant(matrix)[0], right)

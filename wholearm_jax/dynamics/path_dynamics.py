@@ -23,29 +23,29 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.arrays import array, digits
-from wholearm_jax.core.lookup import pick
-from wholearm_jax.core.small_linalg import crossed, inverse, times
+from wholearm_jax.core.arrays import as_device_array, eps_power
+from wholearm_jax.core.lookup import take_row
+from wholearm_jax.core.small_linalg import null_vector, inverse_and_determinant, fused_matmul
 from wholearm_jax.core.status import Status
-from wholearm_jax.model.contact_kinematics import constraint_rows, slip_rows
-from wholearm_jax.model.mechanics import System, configuration_unit
-from wholearm_jax.tracing.path import Resolution, Wire, chebyshev
-from wholearm_jax.tracing.path_root import along_wire
+from wholearm_jax.model.contact_kinematics import constraint_jacobian, tangential_jacobian
+from wholearm_jax.model.mechanics import ScaledMechanics, configuration_unit
+from wholearm_jax.tracing.path import Resolution, ContactPath, chebyshev_points
+from wholearm_jax.tracing.path_root import path_derivatives
 
 TERMS = 5  # 1, v^2, v, tau1, tau2
 
 
-class Table(eqx.Module):
+class PathDynamics(eqx.Module):
     """A reduced wire: polynomials in the panel coordinate `xi` in [-1, 1], lowest power first, SI units.
 
-    `acceleration[p, k]` are the coefficients of `a = ds^2/dt^2` in `(1, v^2, v, tau1, tau2)`, `force[p, k, i]` those of
+    `path_acceleration[p, k]` are the coefficients of `a = ds^2/dt^2` in `(1, v^2, v, tau1, tau2)`, `contact_force[p, k, i]` those of
     the force in constraint `i` [N]: `c_n`, or `c_t` where `tangential` (a contact that rolls), with `grip` its friction
     coefficient (0 elsewhere). `configuration[p, k]` are those of `z`, `velocity[p, k]` those of `dz/ds`.
     `backward[p, k]` are those of `a` in `(1, tau1, tau2)` for travel the other way at rest, times the square of the 5x5
     determinant (against that without friction): the same sign, and smooth where friction would wedge the object on its
     way back. `tension[piece, i]` is `c_t / c_n` (eq. 3) where a contact slides.
     `entry` serves an object that arrives with `z_dot` from another formation: its rows times `z_dot` are `ds/dt` after
-    the inelastic impact and the contacts' impulses [N s] (see `change`).
+    the inelastic impact and the contacts' impulses [N s] (see `resolve_impact`).
     `error` is the largest interpolation error, relative to each function's own size; `condition` the largest
     condition number of the 5x5 matrix.
     """
@@ -75,13 +75,13 @@ class Table(eqx.Module):
         return self.breaks[..., -1] - self.breaks[..., 0]
 
 
-def balance(system: System, z, x, bend, slip_sign, joint_sign):
+def equations_of_motion(system: ScaledMechanics, z, x, bend, slip_sign, joint_sign):
     """The 5x5 matrix and its right-hand sides for `(1, v^2, v, tau1, tau2)` at one place of the wire (object units).
 
     `x = dz/ds`, `bend = x'`; `slip_sign` is Xi, `joint_sign` the signs of the joint speeds.
     """
-    friction = (system.contacts.friction * slip_sign)[:, None] * slip_rows(system.contacts, z)
-    wrench = (constraint_rows(system.contacts, z) - friction).T
+    friction = (system.contacts.friction * slip_sign)[:, None] * tangential_jacobian(system.contacts, z)
+    wrench = (constraint_jacobian(system.contacts, z) - friction).T
     matrix = jnp.concatenate([(system.inertia * x)[:, None], -wrench], axis=1)
     none, weight = jnp.zeros(3, z.dtype), system.inertia[0] * system.gravity
     dry = jnp.concatenate([weight, jnp.zeros(1, z.dtype), -system.dry * joint_sign])
@@ -90,7 +90,7 @@ def balance(system: System, z, x, bend, slip_sign, joint_sign):
     return matrix, jnp.stack([dry, -system.inertia * bend, viscous, *torque], axis=1)
 
 
-def reduce_wire(system: System, wire: Wire) -> Table:
+def tabulate_path_dynamics(system: ScaledMechanics, wire: ContactPath) -> PathDynamics:
     """Solve the 5x5 system at every node of a wire, and at its start for those who enter with speed; tabulate."""
     shape = wire.nodes.shape[:2]
     place = jnp.concatenate([wire.nodes.reshape(-1, 5), wire.start[None]])
@@ -98,19 +98,19 @@ def reduce_wire(system: System, wire: Wire) -> Table:
     chart, xi, turn = wire.chart[owner], wire.slip_sign[owner], wire.joint_sign[owner]
 
     def node(z, u, slip_sign, joint_sign):
-        along = along_wire(system, z, u)
+        along = path_derivatives(system, z, u)
         x, bend = along.x, along.bend
-        matrix, right = balance(system, z, x, bend, slip_sign, joint_sign)
-        back, resting = balance(system, z, x, bend, -slip_sign, -joint_sign)
-        ahead, with_friction = inverse(matrix)
+        matrix, right = equations_of_motion(system, z, x, bend, slip_sign, joint_sign)
+        back, resting = equations_of_motion(system, z, x, bend, -slip_sign, -joint_sign)
+        ahead, with_friction = inverse_and_determinant(matrix)
         # Friction may turn the determinant's sign only by passing through a singular matrix. Without friction,
         # det [M x, -G^T] = x.M x det [G; u]: of M x only the part along x is not in the span of G^T.
         without = stop_gradient(system.inertia @ x**2 * along.determinant)
         upright = stop_gradient(with_friction) * without
-        solution = times(ahead, right)
+        solution = fused_matmul(ahead, right)
         # Orthogonal to the contacts' wrenches nothing but M x a is left.
-        across = crossed(back[:, 1:].T)
-        behind = times(resting[:, jnp.array([0, 3, 4])].T, across) * (across @ back[:, 0]) / without**2
+        across = null_vector(back[:, 1:].T)
+        behind = fused_matmul(resting[:, jnp.array([0, 3, 4])].T, across) * (across @ back[:, 0]) / without**2
         condition = jnp.abs(matrix).sum(0).max() * jnp.abs(ahead).sum(0).max()
         entry = ahead * system.inertia
         return entry, (x, solution[0], solution[1:], behind, condition, upright)
@@ -122,8 +122,8 @@ def reduce_wire(system: System, wire: Wire) -> Table:
     per_term = jnp.stack([jnp.ones_like(torque), jnp.ones_like(torque), jnp.ones_like(torque), 1 / torque, 1 / torque])
     unit = configuration_unit(system.length)
     # Apart from what friction and mass change, so that scenes that differ in these alone share their wires.
-    places, by_places = _fitted({"configuration": wire.nodes * unit, "velocity": x * unit})
-    dynamics, by_dynamics = _fitted(
+    places, by_places = _fit_panels({"configuration": wire.nodes * unit, "velocity": x * unit})
+    dynamics, by_dynamics = _fit_panels(
         {
             "acceleration": ahead * per_term,
             "backward": behind * per_term[jnp.array([0, 3, 4])],
@@ -133,7 +133,7 @@ def reduce_wire(system: System, wire: Wire) -> Table:
     worst = condition.max()
     eps = jnp.finfo(x.dtype).eps
     broken = (worst > 0.01 / eps) | ~(upright.min() > 0)
-    return Table(
+    return PathDynamics(
         breaks=wire.breaks,
         count=wire.count,
         factor=wire.factor,
@@ -152,21 +152,21 @@ def reduce_wire(system: System, wire: Wire) -> Table:
     )
 
 
-def blank(resolution: Resolution, contacts: int = 4) -> Table:
+def placeholder_dynamics(resolution: Resolution, contacts: int = 4) -> PathDynamics:
     """A table of the right shapes that holds no wire: something to compile with."""
     pieces, panels, nodes, _ = resolution
-    zero, whole, one = array(0.0), array(0), array(1)
+    zero, whole, one = as_device_array(0.0), as_device_array(0), as_device_array(1)
     each = {name: np.zeros((panels, nodes, n)) for name, n in (("acceleration", 5), ("backward", 3))}
     each |= {name: np.zeros((panels, nodes, 5)) for name in ("configuration", "velocity")}
     each |= {"force": np.zeros((panels, nodes, contacts, TERMS)), "tension": np.zeros((pieces, contacts))}
     each |= {"breaks": np.arange(pieces + 1.0), "factor": np.ones(pieces), "torque_limit": np.ones(2)}
     each |= {"tangential": np.zeros(contacts, bool), "grip": np.zeros(contacts)}
     each |= {"entry": np.zeros((5, 5)), "first": np.zeros(pieces, int), "panels": np.ones(pieces, int)}
-    filled = {name: array(value) for name, value in each.items()}
-    return Table(count=one, error=zero, condition=zero, status=whole, **filled)
+    filled = {name: as_device_array(value) for name, value in each.items()}
+    return PathDynamics(count=one, error=zero, condition=zero, status=whole, **filled)
 
 
-class Change(NamedTuple):
+class Impact(NamedTuple):
     """Entering a formation with speed: `ds/dt` [1/s] after the impact and the contacts' impulses [N s].
 
     `size` [N s] is the largest sum of magnitudes that makes up an impulse: against it rounding is judged.
@@ -177,7 +177,7 @@ class Change(NamedTuple):
     size: Float[Array, ""]
 
 
-def change(table: Table, z_dot: Float[Array, "5"]) -> Change:
+def resolve_impact(table: PathDynamics, z_dot: Float[Array, "5"]) -> Impact:
     """The inelastic impact by which a formation takes over from another that moves with `z_dot` (SI).
 
     Velocities after it are the new wire's, `x v`; impulses `p` obey the friction of forward travel:
@@ -188,23 +188,23 @@ def change(table: Table, z_dot: Float[Array, "5"]) -> Change:
     `z_dot_plus = x v` and compressive `p`, what is lost is that of `z_dot_plus - z_dot_minus` and the work of friction.
     """
     after = table.entry @ z_dot
-    return Change(after[0], after[1:], (jnp.abs(table.entry) @ jnp.abs(z_dot))[1:].max())
+    return Impact(after[0], after[1:], (jnp.abs(table.entry) @ jnp.abs(z_dot))[1:].max())
 
 
-def powers(table: Table, piece: Int[Array, ""], s: Float[Array, ""]) -> tuple[Int[Array, ""], Float[Array, ""]]:
+def locate_panel(table: PathDynamics, piece: Int[Array, ""], s: Float[Array, ""]) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The panel of `piece` that serves `s` (the nearest one beyond the piece's ends) and the panel coordinate.
 
     More than a panel beyond the piece its functions stay what they are there: only steps that will be taken again, and
     intervals of an optimisation under way, come so far.
     """
-    low, high, panels = pick(table.breaks, piece), pick(table.breaks, piece + 1), pick(table.panels, piece)
+    low, high, panels = take_row(table.breaks, piece), take_row(table.breaks, piece + 1), take_row(table.panels, piece)
     width = jnp.where(high > low, high - low, 1.0)
     share = (s - low) / width * panels
     local = jnp.clip(jnp.floor(jax.lax.stop_gradient(share)), 0, jnp.maximum(panels - 1, 0))
-    return pick(table.first, piece) + local.astype(int), jnp.clip(2 * (share - local) - 1, -3.0, 3.0)
+    return take_row(table.first, piece) + local.astype(int), jnp.clip(2 * (share - local) - 1, -3.0, 3.0)
 
 
-def polynomial(coefficients: Float[Array, "powers ..."], xi: Float[Array, ""]) -> Float[Array, "..."]:
+def evaluate_polynomial(coefficients: Float[Array, "powers ..."], xi: Float[Array, ""]) -> Float[Array, "..."]:
     """The value of a polynomial, lowest power first."""
     while (count := coefficients.shape[0]) > 1:
         even, odd = coefficients[0::2], coefficients[1::2]
@@ -214,52 +214,52 @@ def polynomial(coefficients: Float[Array, "powers ..."], xi: Float[Array, ""]) -
     return coefficients[0]
 
 
-def derivative(coefficients: Float[Array, "powers ..."]) -> Float[Array, "powers_1 ..."]:
+def differentiate_polynomial(coefficients: Float[Array, "powers ..."]) -> Float[Array, "powers_1 ..."]:
     """The coefficients of a polynomial's derivative, lowest power first."""
     power = jnp.arange(1.0, coefficients.shape[0], dtype=coefficients.dtype)
     return coefficients[1:] * power.reshape(-1, *(1,) * (coefficients.ndim - 1))
 
 
-def on_panel(coefficients: Float[Array, "panels powers ..."], panel: Int[Array, ""], xi: Float[Array, ""]):
-    """The value of one of a table's functions at the place that `powers` tells."""
-    return polynomial(pick(coefficients, panel), xi)
+def evaluate(coefficients: Float[Array, "panels powers ..."], panel: Int[Array, ""], xi: Float[Array, ""]):
+    """The value of one of a table's functions at the place that `locate_panel` tells."""
+    return evaluate_polynomial(take_row(coefficients, panel), xi)
 
 
-def combined(
+def evaluate_dot(
     coefficients: Float[Array, "panels powers *slots terms"], panel: Int[Array, ""], xi, terms: Float[Array, "terms"]
 ) -> Float[Array, "*slots"]:
-    """The sum of one of a table's functions times `terms`, at the place that `powers` tells."""
-    return _combined(pick(coefficients, panel), xi, terms)
+    """The sum of one of a table's functions times `terms`, at the place that `locate_panel` tells."""
+    return _evaluate_dot(take_row(coefficients, panel), xi, terms)
 
 
 @jax.custom_jvp
-def _combined(coefficients, xi, terms):
-    return polynomial(coefficients, xi) @ terms
+def _evaluate_dot(coefficients, xi, terms):
+    return evaluate_polynomial(coefficients, xi) @ terms
 
 
-def _change_of_combined(primals, tangents):
+def _evaluate_dot_jvp(primals, tangents):
     """The slope in `xi` is summed before it is multiplied by the many directions there may be."""
     coefficients, xi, terms = primals
     zero = jax.custom_derivatives.SymbolicZero
     change, rate, turn = (None if isinstance(tangent, zero) else tangent for tangent in tangents)
-    values = polynomial(coefficients, xi)
+    values = evaluate_polynomial(coefficients, xi)
     total = jnp.zeros(values.shape[:-1], values.dtype)
     if turn is not None:
         total = values @ turn
     if rate is not None:
-        total = total + polynomial(derivative(coefficients), xi) @ terms * rate
+        total = total + evaluate_polynomial(differentiate_polynomial(coefficients), xi) @ terms * rate
     if change is not None:
-        total = total + polynomial(change, xi) @ terms
+        total = total + evaluate_polynomial(change, xi) @ terms
     return values @ terms, total
 
 
-_combined.defjvp(_change_of_combined, symbolic_zeros=True)
+_evaluate_dot.defjvp(_evaluate_dot_jvp, symbolic_zeros=True)
 
 
-def _fitted(columns: dict[str, Float[Array, "panels nodes *shape"]]) -> tuple[dict[str, Array], Float[Array, ""]]:
-    """Polynomials through the values of functions at the nodes, and the largest of their errors (`_error`)."""
+def _fit_panels(columns: dict[str, Float[Array, "panels nodes *shape"]]) -> tuple[dict[str, Array], Float[Array, ""]]:
+    """Polynomials through the values of functions at the nodes, and the largest of their errors (`_interpolation_error`)."""
     every = jnp.concatenate([c.reshape(*c.shape[:2], -1) for c in columns.values()], axis=2)
-    to_powers, to_last = _transforms(every.shape[1])
+    to_powers, to_last = _chebyshev_transforms(every.shape[1])
     ends = np.cumsum([math.prod(c.shape[2:]) for c in columns.values()])[:-1]
     # A product that is left to a library keeps a loop over phases in pieces: whole, it takes twice as long to compile.
     powers, lasts = (
@@ -267,11 +267,11 @@ def _fitted(columns: dict[str, Float[Array, "panels nodes *shape"]]) -> tuple[di
         for matrix, values in ((to_powers, every), (to_last, stop_gradient(every)))
     )
     fitted = {name: each.reshape(c.shape) for (name, c), each in zip(columns.items(), powers, strict=True)}
-    errors = [_error(c.reshape(*c.shape[:2], -1), last) for c, last in zip(columns.values(), lasts, strict=True)]
+    errors = [_interpolation_error(c.reshape(*c.shape[:2], -1), last) for c, last in zip(columns.values(), lasts, strict=True)]
     return fitted, jnp.stack(errors).max()
 
 
-def _error(values: Float[Array, "panels nodes functions"], last: Float[Array, "panels four functions"]):
+def _interpolation_error(values: Float[Array, "panels nodes functions"], last: Float[Array, "panels four functions"]):
     """The largest error of polynomials, relative to the largest value of each function, by the last four Chebyshev
     coefficients of every panel.
 
@@ -285,14 +285,14 @@ def _error(values: Float[Array, "panels nodes functions"], last: Float[Array, "p
     before, tail = jnp.abs(last[:, :2]).sum(1), jnp.abs(last[:, 2:]).sum(1)
     beyond = jnp.where(3 * tail < before, 2 * tail / jnp.where(tail < before, before - tail, 1.0), 1.0)
     size = jnp.abs(stop_gradient(values)).max((0, 1))
-    least = digits(values, 1 / 3) * size.max() + jnp.finfo(values.dtype).tiny
+    least = eps_power(values, 1 / 3) * size.max() + jnp.finfo(values.dtype).tiny
     return ((tail * beyond).max(0) / jnp.maximum(size, least)).max()
 
 
 @functools.cache
-def _transforms(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+def _chebyshev_transforms(nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """From values at Chebyshev nodes to the coefficients of powers, and to the last four Chebyshev coefficients."""
-    x = chebyshev(nodes)
+    x = chebyshev_points(nodes)
     to_chebyshev = np.linalg.inv(np.polynomial.chebyshev.chebvander(x, nodes - 1))
     series = [np.polynomial.chebyshev.cheb2poly(np.eye(nodes)[k]) for k in range(nodes)]
     to_powers = np.stack([np.pad(p, (0, nodes - len(p))) for p in series], axis=1) @ to_chebyshev

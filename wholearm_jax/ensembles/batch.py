@@ -4,8 +4,8 @@ Two programs, compiled side by side, serve all scenes: one traces the wires of a
 of motion on them and simulates; each is a scan over its phases. A CPU does a block of scenes one after the other, each
 with loops that do what it needs and no more; a GPU does them side by side (`jax.vmap`). Where all scenes have the same
 wires, these are traced once a block. Where there are several devices `shard_map` gives each its own block. A chunk is a
-number of blocks. The first pass is coarse (`QUICK`): few panels, fewer steps. It knows its error; scenes for which that
-is too large, or which ran out of steps, are packed together and done again at full resolution (`FULL`), and what is
+number of blocks. The first pass is coarse (`COARSE_PASS`): few panels, fewer steps. It knows its error; scenes for which that
+is too large, or which ran out of steps, are packed together and done again at full resolution (`FINE_PASS`), and what is
 left then alone, by `plan.simulate`. So neither the slowest scene nor one that cannot be followed holds up the others
 or touches their results.
 """
@@ -22,43 +22,43 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.programs import Program, beside, wait
+from wholearm_jax.core.programs import Program, call_in_background, wait_for
 from wholearm_jax.core.status import Status
 from wholearm_jax.core.validation import require_positive, require_x64
-from wholearm_jax.dynamics.path_dynamics import Table, reduce_wire
+from wholearm_jax.dynamics.path_dynamics import PathDynamics, tabulate_path_dynamics
 from wholearm_jax.ensembles.ensemble import Ensemble, stack
-from wholearm_jax.model.mechanics import system
-from wholearm_jax.model.scene import Formation, Scene, body
-from wholearm_jax.model.schedule import Torque, padded
-from wholearm_jax.phases.phase import Outcome, final_configuration
+from wholearm_jax.model.mechanics import scaled_mechanics
+from wholearm_jax.model.scene import ContactFormation, Scene, rigid_body
+from wholearm_jax.model.schedule import TorqueSchedule, pad_schedule
+from wholearm_jax.phases.phase import SimulatedPhase, final_configuration
 from wholearm_jax.phases.plan import (
     require_covered,
     require_motion,
     simulate,
-    simulate_first,
-    simulate_next,
-    simulate_told,
-    stacked,
-    steps_within,
-    wires_together,
+    initial_carry,
+    scan_step,
+    phase_inputs,
+    stack_trees,
+    has_torque_jumps,
+    trace_paths_in_one_program,
 )
-from wholearm_jax.phases.rest_certificate import surely_held
+from wholearm_jax.phases.rest_certificate import certify_rest
 from wholearm_jax.phases.result import Result
-from wholearm_jax.simulation.integrator import Integration
-from wholearm_jax.tracing.path import Resolution, Wire, blank
+from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.tracing.path import Resolution, ContactPath, placeholder_path
 
 BLOCK = 128  # scenes that one device takes at once
 CHUNK = 4096  # scenes whose results are kept together
-ARRIVAL = 0.01  # share of the wire: plans that vary cannot end where the one must that torques were made for
+BATCH_ARRIVAL = 0.01  # share of the wire: plans that vary cannot end where the one must that torques were made for
 GOOD, FINER, ALONE = range(3)  # what becomes of a scene at a level
 EXACT = 1e-9  # tolerances below this begin at the full resolution
 
 
-class Checked(NamedTuple):
+class BatchResult(NamedTuple):
     """What became of scenes; leading axes run over them.
 
     `status` are `Status` values: that of the first phase that is not ok. `margin` [N] is the least over the plan, minus
-    infinity where a phase has no motion to score. `phase`, `contact` (a row of the phase's `Formation.names`, -1:
+    infinity where a phase has no motion to score. `phase`, `contact` (a row of the phase's `ContactFormation.names`, -1:
     none) and `time` [s] say where it failed, or where the margin is where it did not. `end` is `z` (SI) where the
     motion of the failed or last phase ended, NaN where that phase has no wire.
     """
@@ -71,20 +71,20 @@ class Checked(NamedTuple):
     end: Float[Array | np.ndarray, "*scenes 5"]
 
 
-class Level(NamedTuple):
+class Fidelity(NamedTuple):
     """How finely to compute, and the table error up to which the result counts."""
 
     resolution: Resolution
-    how: Integration
+    how: IntegratorOptions
     error: float
 
 
-QUICK = Level(Resolution(4, 7, 8, 64), Integration(tolerance=1e-8, max_steps=96, stages=4), 5e-7)
-FULL = Level(Resolution(), Integration(), 1e-9)
+COARSE_PASS = Fidelity(Resolution(4, 7, 8, 64), IntegratorOptions(tolerance=1e-8, max_steps=96, stages=4), 5e-7)
+FINE_PASS = Fidelity(Resolution(), IntegratorOptions(), 1e-9)
 
 
-class Source(Protocol):
-    """What scenes come from: an `Ensemble`, or scenes that are given (`Given`)."""
+class SceneSource(Protocol):
+    """What scenes come from: an `Ensemble`, or scenes that are given (`SceneBatch`)."""
 
     @property
     def nominal(self) -> Scene:
@@ -101,7 +101,7 @@ class Source(Protocol):
         ...
 
 
-class Given(eqx.Module):
+class SceneBatch(eqx.Module):
     """Scenes stacked along a leading axis (`variation.stack`)."""
 
     scenes: Scene
@@ -127,7 +127,7 @@ class Given(eqx.Module):
 
     def part(self, numbers: np.ndarray) -> "Given":
         """Some of the scenes, numbered anew."""
-        return Given(jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), self.scenes))
+        return SceneBatch(jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), self.scenes))
 
 
 class _Stop(NamedTuple):
@@ -144,65 +144,65 @@ class _Stop(NamedTuple):
     held: Bool[Array, ""]
 
 
-def check(
+def check_batch(
     scenes: Ensemble | Scene | Sequence[Scene],
-    torque: Torque,
+    torque: TorqueSchedule,
     *,
     count: int | None = None,
     tolerance: float = 1e-6,
-    arrival: float = ARRIVAL,
+    arrival: float = BATCH_ARRIVAL,
     chunk: int = CHUNK,
     devices: Sequence[Any] | None = None,
-) -> Checked:
+) -> BatchResult:
     """Check a torque schedule against many scenes: the first `count` of an ensemble, or all that are given.
 
     `scenes` may differ in every number, in formations and in the number of vertices (see `variation.stack`).
     Margins are right to 1e-6 N; a `tolerance` [N] below 1e-9 has all computed as by `simulate`. A phase arrives when
     it ends within a share `arrival` of its wire's length of the end (1e-6 for a plan that does not vary, by
-    `simulate`), at a speed that fits (`verdict.BRAKING`). Memory is that of `chunk` scenes beside the result. Returns
-    `Checked`: status, margin, time, contact, phase and end pose of each scene. Never raises for a scene that fails:
+    `simulate`), at a speed that fits (`verdict.ARRIVAL_SPEED_FACTOR`). Memory is that of `chunk` scenes beside the result. Returns
+    `BatchResult`: status, margin, time, contact, phase and end pose of each scene. Never raises for a scene that fails:
     that is a status. Raises ValueError for one scene that is not stacked, for a schedule shorter than a plan, for
     numbers that are not positive, and for a `count` of more scenes than are given.
     """
     if isinstance(scenes, Scene) and np.ndim(scenes.object.mass) == 0:
         raise ValueError("this is one scene: check [scene], or vary it (wholearm_jax.ensembles.ensemble.vary)")
-    source = scenes if isinstance(scenes, Ensemble) else Given(scenes if isinstance(scenes, Scene) else stack(scenes))
+    source = scenes if isinstance(scenes, Ensemble) else SceneBatch(scenes if isinstance(scenes, Scene) else stack(scenes))
     if count is None:
         if isinstance(source, Ensemble):
             raise ValueError("an ensemble has no end: say how many of its scenes to check, with count")
         count = source.count
-    elif isinstance(source, Given) and count > source.count:
+    elif isinstance(source, SceneBatch) and count > source.count:
         raise ValueError(f"count is {count}, but {source.count} scenes are given")
-    parts = check_chunks(source, torque, count, tolerance=tolerance, arrival=arrival, chunk=chunk, devices=devices)
-    return Checked(*(np.concatenate(column) for column in zip(*(part for _, part in parts), strict=True)))
+    parts = check_in_chunks(source, torque, count, tolerance=tolerance, arrival=arrival, chunk=chunk, devices=devices)
+    return BatchResult(*(np.concatenate(column) for column in zip(*(part for _, part in parts), strict=True)))
 
 
-def check_chunks(
-    source: Ensemble | Given,
-    torque: Torque,
+def check_in_chunks(
+    source: Ensemble | SceneBatch,
+    torque: TorqueSchedule,
     count: int,
     *,
     tolerance: float = 1e-6,
-    arrival: float = ARRIVAL,
+    arrival: float = BATCH_ARRIVAL,
     chunk: int = CHUNK,
     devices: Sequence[Any] | None = None,
     wanted: Sequence[int] | None = None,
-) -> Iterator[tuple[int, Checked]]:
-    """`check` one chunk after the other: numbers of chunks (those `wanted`, by default all) with their results."""
+) -> Iterator[tuple[int, BatchResult]]:
+    """`check_batch` one chunk after the other: numbers of chunks (those `wanted`, by default all) with their results."""
     require_x64()
     require_positive(count=count, tolerance=tolerance, arrival=arrival, chunk=chunk)
     require_motion(source.nominal)  # holds need linear programmes, which compiled checks leave out
     require_covered(source.nominal, torque)
     mesh = Mesh(np.asarray(devices or jax.local_devices()), ("scenes",))
-    levels = (QUICK, FULL) if tolerance >= EXACT else (FULL,)
+    levels = (COARSE_PASS, FINE_PASS) if tolerance >= EXACT else (FINE_PASS,)
     for number in range(-(-count // chunk)) if wanted is None else wanted:
         rows = np.arange(number * chunk, min(count, (number + 1) * chunk))
         yield number, _check_rows(source, rows, torque, jnp.asarray(arrival), levels, mesh)
 
 
-def _check_rows(source, rows, torque: Torque, arrival, levels, mesh) -> Checked:
+def _check_rows(source, rows, torque: TorqueSchedule, arrival, levels, mesh) -> BatchResult:
     """Check some scenes, level by level; alone those of the last that are not good, and of any that want `ALONE`."""
-    schedule, steps = padded(torque), steps_within(source.nominal, torque)
+    schedule, steps = pad_schedule(torque), has_torque_jumps(source.nominal, torque)
     found, left, alone = None, np.arange(len(rows)), []
     for level in levels:
         level = level._replace(how=replace(level.how, steps=steps))
@@ -224,7 +224,7 @@ def _check_rows(source, rows, torque: Torque, arrival, levels, mesh) -> Checked:
     return found
 
 
-def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):
+def _check_packed(source, rows, schedule, arrival, level: Fidelity, mesh: Mesh):
     """Check scenes block by block, the last block filled up with its last scene."""
     size = BLOCK * mesh.size
     filled = np.append(rows, np.repeat(rows[-1:], -len(rows) % size))
@@ -237,13 +237,13 @@ def _check_packed(source, rows, schedule, arrival, level: Level, mesh: Mesh):
     return columns
 
 
-def _check_block(source: Source, numbers, schedule: Torque, arrival, level: Level, mesh: Mesh):
+def _check_block(source: SceneSource, numbers, schedule: TorqueSchedule, arrival, level: Fidelity, mesh: Mesh):
     """Check `BLOCK` scenes a device: on a processor one after the other."""
     side_by_side = mesh.devices.flat[0].platform != "cpu"
     told = source, schedule, arrival, level, side_by_side
-    compiled = beside(_check_blank, mesh, told, numbers)
+    compiled = call_in_background(_check_blank, mesh, told, numbers)
     wires = _on(mesh, _wires_of, (source, level.resolution, side_by_side), numbers)
-    wait(compiled)
+    wait_for(compiled)
     return _on(mesh, _checks_of, told, numbers, wires)
 
 
@@ -251,7 +251,7 @@ def _check_blank(mesh: Mesh, told: tuple, numbers) -> None:
     """Check scenes on wires that were not found: that compiles the program for those that were."""
     source, _, _, level, _ = told
     shape = mesh.size if source.same_wires else len(numbers), len(source.nominal.phases)
-    wires = jax.tree.map(lambda a: np.broadcast_to(a, (*shape, *a.shape)), blank(level.resolution))
+    wires = jax.tree.map(lambda a: np.broadcast_to(a, (*shape, *a.shape)), placeholder_path(level.resolution))
     if mesh.size > 1:  # where those that are traced will be
         wires = jax.device_put(wires, NamedSharding(mesh, PartitionSpec("scenes")))
     _on(mesh, _checks_of, told, numbers, wires)
@@ -280,7 +280,7 @@ def _wires_of(told, numbers):
     source, resolution, side_by_side = told
 
     def one(number):
-        return wires_together(source.draw(number), resolution)
+        return trace_paths_in_one_program(source.draw(number), resolution)
 
     return _each(one, side_by_side)(numbers[:1] if source.same_wires else numbers)
 
@@ -304,26 +304,26 @@ def _each(function, side_by_side: bool):
     return jax.vmap(function) if side_by_side else partial(jax.lax.map, function)
 
 
-def check_scene(scene: Scene, schedule: Torque, arrival, level: Level) -> tuple[Checked, Int[Array, ""]]:
+def check_scene(scene: Scene, schedule: TorqueSchedule, arrival, level: Fidelity) -> tuple[BatchResult, Int[Array, ""]]:
     """Check one scene (under any transformation), and say whether this level's result is `GOOD`, or wants a `FINER` one
     or `simulate` for this scene `ALONE`."""
-    return check_wires(scene, wires_together(scene, level.resolution), schedule, arrival, level)
+    return check_wires(scene, trace_paths_in_one_program(scene, level.resolution), schedule, arrival, level)
 
 
-def check_wires(scene: Scene, wires: Wire, schedule: Torque, arrival, level: Level) -> tuple[Checked, Int[Array, ""]]:
+def check_wires(scene: Scene, wires: ContactPath, schedule: TorqueSchedule, arrival, level: Fidelity) -> tuple[BatchResult, Int[Array, ""]]:
     """Check one scene on its wires."""
-    solid = body(scene.object)
+    solid = rigid_body(scene.object)
 
     def one(clock, phase):
         wire, motion, formation = phase
-        mechanics = system(solid, scene.hand, scene.gravity, formation)
-        table = reduce_wire(mechanics, wire)
-        clock, done = simulate_next(schedule, level.how, arrival, clock, (table, *motion))
-        held = surely_held(mechanics, table, schedule, done)
+        mechanics = scaled_mechanics(solid, scene.hand, scene.gravity, formation)
+        table = tabulate_path_dynamics(mechanics, wire)
+        clock, done = scan_step(schedule, level.how, arrival, clock, (table, *motion))
+        held = certify_rest(mechanics, table, schedule, done)
         return clock, _stop(table, done, formation, level, held)
 
-    told = stacked([(simulate_told(p), p.formation) for p in scene.phases])
-    _, stops = jax.lax.scan(one, simulate_first(schedule), (wires, *told))
+    told = stack_trees([(phase_inputs(p), p.formation) for p in scene.phases])
+    _, stops = jax.lax.scan(one, initial_carry(schedule), (wires, *told))
     failed = stops.status != int(Status.OK)
     where = jnp.where(failed.any(), jnp.argmax(failed), jnp.argmin(stops.margin))
     last = jnp.where(failed.any(), where, len(scene.phases) - 1)
@@ -331,7 +331,7 @@ def check_wires(scene: Scene, wires: Wire, schedule: Torque, arrival, level: Lev
     counts = jnp.arange(len(scene.phases)) <= last
     needed = counts | (stops.status != int(Status.NO_CONVERGENCE))
     ok = ~failed.any()
-    answer = Checked(
+    answer = BatchResult(
         status=stops.status[where],
         margin=stops.margin.min(),
         time=jnp.where(ok, stops.margin_time, stops.time)[where],
@@ -344,7 +344,7 @@ def check_wires(scene: Scene, wires: Wire, schedule: Torque, arrival, level: Lev
     return answer, jnp.select([jnp.any(~stops.good & needed), doubtful], [FINER, ALONE], GOOD)
 
 
-def _stop(table: Table, done: Outcome, formation: Formation, level: Level, held) -> _Stop:
+def _stop(table: PathDynamics, done: SimulatedPhase, formation: ContactFormation, level: Fidelity, held) -> _Stop:
     """One phase's result, and whether it is to be trusted: a fine table, and neither steps nor pieces used up; rests
     that are `held` for sure."""
     motion = done.motion
@@ -366,12 +366,12 @@ def _stop(table: Table, done: Outcome, formation: Formation, level: Level, held)
     )
 
 
-def _check_alone(scene: Scene, torque: Torque, arrival) -> Checked:
+def _check_alone(scene: Scene, torque: TorqueSchedule, arrival) -> BatchResult:
     """One scene by `simulate`, which refines until all is fine."""
     return from_result(simulate(scene, torque, arrival=float(arrival)))
 
 
-def from_result(result: Result) -> Checked:
+def from_result(result: Result) -> BatchResult:
     """A simulated plan as one scene of a check."""
     rows = list(result.phases)
     failed = next((k for k, p in enumerate(rows) if p.status is not Status.OK), None)
@@ -381,7 +381,7 @@ def from_result(result: Result) -> Checked:
     named = p.margin_contact if failed is None else p.contact
     table, motion = last.traced.table, last.outcome.motion
     end = final_configuration(table, motion) if int(table.status) == Status.OK else jnp.full(5, jnp.nan)
-    return Checked(
+    return BatchResult(
         status=np.asarray(int(result.status)),
         margin=np.asarray(result.margin),
         time=np.asarray(p.margin_time if failed is None else p.time),

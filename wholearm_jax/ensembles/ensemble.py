@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.model.polygon import stays_simple
+from wholearm_jax.model.polygon import remains_simple
 from wholearm_jax.model.scene import COORDINATES, LINKS, Scene
-from wholearm_jax.phases.plan import stacked
+from wholearm_jax.phases.plan import stack_trees
 
 FINGERS = ("finger 1", "finger 2")
 
@@ -52,7 +52,7 @@ GEOMETRY = frozenset({"vertices", "center_of_mass", "joint", "length", "offset",
 """Those that wires depend on."""
 
 
-class Amount(NamedTuple):
+class Spread(NamedTuple):
     """Half the width of a uniform draw: a share of the value where `relative`, otherwise in the value's unit."""
 
     size: float
@@ -63,7 +63,7 @@ class Ensemble(eqx.Module):
     """Scenes like `scene` in which the quantities named in `amounts` vary; `seed` chooses which."""
 
     scene: Scene
-    amounts: tuple[tuple[str, Amount], ...] = eqx.field(static=True)
+    amounts: tuple[tuple[str, Spread], ...] = eqx.field(static=True)
     seed: int = eqx.field(static=True, default=0)
 
     @property
@@ -115,7 +115,7 @@ class Ensemble(eqx.Module):
         return scene
 
 
-def vary(scene: Scene, amounts: dict[str, float | str], *, seed: int = 0) -> Ensemble:
+def make_ensemble(scene: Scene, amounts: dict[str, float | str], *, seed: int = 0) -> Ensemble:
     """Build an ensemble from amounts such as `{"vertices": 0.0005, "friction": "20%"}`.
 
     Raises ValueError for a quantity that the scene does not have, an amount that is not one, or one by which what is
@@ -137,7 +137,7 @@ def stack(scenes: Sequence[Scene]) -> Scene:
     alike = [_renamed(_padded(s, capacity), scenes[0]) for s in scenes]
     if len({jax.tree.structure(s) for s in alike}) > 1:
         raise ValueError("stacked scenes need the same phases (number, arrival) and the same optional entries")
-    return stacked(alike)
+    return stack_trees(alike)
 
 
 def _padded(scene: Scene, capacity: int) -> Scene:
@@ -163,7 +163,7 @@ def _names(scene: Scene, quantity: str) -> tuple[str, ...]:
     return (quantity,) if entries is None else tuple(f"{quantity} {entry}" for entry in entries)
 
 
-def _amount(scene: Scene, name: str, given: float | str) -> Amount:
+def _amount(scene: Scene, name: str, given: float | str) -> Spread:
     if name not in QUANTITIES:
         raise ValueError(f"{name}: not a quantity that varies; these do: {', '.join(QUANTITIES)}")
     if QUANTITIES[name].where(scene) is None:
@@ -175,14 +175,14 @@ def _amount(scene: Scene, name: str, given: float | str) -> Amount:
         size = math.nan
     if not 0 <= size < math.inf:
         raise ValueError(f"{name}={text}: write an amount such as 0.0005, in SI units, or 20%")
-    amount = Amount(size, text.endswith("%"))
+    amount = Spread(size, text.endswith("%"))
     trouble = _trouble(scene, name, amount)
     if trouble is not None:
         raise ValueError(f"{name}={text}: too much, {trouble}")
     return amount
 
 
-def _trouble(scene: Scene, name: str, amount: Amount) -> str | None:
+def _trouble(scene: Scene, name: str, amount: Spread) -> str | None:
     """What may be wrong with scenes that are drawn with an amount."""
     value, allowed = np.asarray(QUANTITIES[name].where(scene)), QUANTITIES[name].allowed
     width = amount.size * (np.abs(value) if amount.relative else np.ones_like(value))
@@ -193,6 +193,6 @@ def _trouble(scene: Scene, name: str, amount: Amount) -> str | None:
         return "the fingers could change sides"
     if name == "vertices":
         count = int(scene.object.count)
-        if not stays_simple(value[:count], np.hypot(*width[:count].T)):
+        if not remains_simple(value[:count], np.hypot(*width[:count].T)):
             return "edges of the polygon could cross"
     return None

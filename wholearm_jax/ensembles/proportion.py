@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
     """Wilson's score interval for a proportion; `z` is the normal quantile (default: 95 %)."""
     rate, weight = successes / trials, z**2 / trials
     middle = (rate + weight / 2) / (1 + weight)

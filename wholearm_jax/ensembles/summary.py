@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from wholearm_jax.core.status import Status
-from wholearm_jax.ensembles.batch import Checked
-from wholearm_jax.ensembles.proportion import wilson
+from wholearm_jax.ensembles.batch import BatchResult
+from wholearm_jax.ensembles.proportion import wilson_interval
 from wholearm_jax.model.scene import Scene
 
 SAMPLE = 100_000  # scenes, evenly spread, from which quantiles and influences are taken
@@ -17,7 +17,7 @@ QUANTILES = (0.0, 0.01, 0.05, 0.5, 0.95, 1.0)
 
 
 @dataclass(frozen=True)
-class Survey:
+class EnsembleSummary:
     """How many of `count` scenes hold and how the others fail.
 
     `failures` counts (phase, status, contact), by name. `numbers` are the sampled scenes, `margins` [N] and `statuses`
@@ -34,7 +34,7 @@ class Survey:
     @property
     def interval(self) -> tuple[float, float]:
         """The 95 % confidence interval of the share that holds (Wilson's)."""
-        return wilson(self.holds, self.count)
+        return wilson_interval(self.holds, self.count)
 
     @property
     def quantiles(self) -> dict[str, float]:
@@ -67,7 +67,7 @@ class Survey:
         }
 
 
-def survey(scene: Scene, chunks: Iterable[Checked], count: int) -> Survey:
+def summarise(scene: Scene, chunks: Iterable[BatchResult], count: int) -> EnsembleSummary:
     """Count through chunks of results; `scene` gives phases and contacts their names."""
     every, first, holds, failures = max(1, -(-count // SAMPLE)), 0, 0, Counter()
     numbers, margins, statuses = [], [], []
@@ -86,10 +86,10 @@ def survey(scene: Scene, chunks: Iterable[Checked], count: int) -> Survey:
         margins.append(part.margin[kept])
         statuses.append(part.status[kept])
         first += len(part.status)
-    return Survey(count, holds, dict(failures), *(np.concatenate(column) for column in (numbers, margins, statuses)))
+    return EnsembleSummary(count, holds, dict(failures), *(np.concatenate(column) for column in (numbers, margins, statuses)))
 
 
-def influences(margins: Float[np.ndarray, "n"], shifts: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "p"]:
+def rank_correlations(margins: Float[np.ndarray, "n"], shifts: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "p"]:
     """Spearman's rank correlation of the margin with each parameter, like values sharing the mean of their ranks; 0
     where either does not vary."""
     from scipy.stats import rankdata  # takes half a second to import

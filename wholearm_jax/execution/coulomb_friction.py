@@ -21,18 +21,18 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from wholearm_jax.execution.mujoco_model import FreeBodies
+from wholearm_jax.execution.mujoco_model import MujocoModel
 
 EXACT, ROUNDS = 1e-6, 100  # when to stop: share of the largest friction by which forces still change; rounds at most
 
 
 def advance(
-    bodies: FreeBodies, data, torque, before: Float[np.ndarray, "pairs 2"]
+    bodies: MujocoModel, data, torque, before: Float[np.ndarray, "pairs 2"]
 ) -> tuple[Float[np.ndarray, "pairs 2"], float]:
     """One time step under `torque`: the forces `(c_n, c_t)` [N] of all pairs on the object, and how wrong they are.
 
     `before` are those of the step before, from which friction is looked for. The second is the largest speed [m/s] by
-    which a contact slips in this step against Coulomb's law: by `EXACT` of what friction can do in a step, more where
+    which a contact slips in this step against Coulomb's law: by `SOLVER_TOL` of what friction can do in a step, more where
     `ROUNDS` were not enough (at rest, where the friction of several contacts is not determined), and much where no
     forces agree with that law, as there need not be any if friction is large.
     """
@@ -47,7 +47,7 @@ def advance(
     return forces, wrong
 
 
-def _settled(bodies: FreeBodies, data, pair, address, rows, ct) -> tuple[Float[np.ndarray, "touching"], float]:
+def _settled(bodies: MujocoModel, data, pair, address, rows, ct) -> tuple[Float[np.ndarray, "touching"], float]:
     """Friction forces that agree with Coulomb's law, and by how much slips do not [m/s]."""
     if not len(pair):
         return ct, 0.0
@@ -70,7 +70,7 @@ def _settled(bodies: FreeBodies, data, pair, address, rows, ct) -> tuple[Float[n
 
 
 def _touching(
-    bodies: FreeBodies, data
+    bodies: MujocoModel, data
 ) -> tuple[Int[np.ndarray, "touching"], Int[np.ndarray, "touching"], Float[np.ndarray, "touching 5"]]:
     """Contacts that touch: their rows of `names`, where MuJoCo keeps their normal forces, and `J_t`.
 

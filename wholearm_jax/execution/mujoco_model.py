@@ -3,7 +3,7 @@ r"""Virtual hardware: the hand and the polygon as free bodies in MuJoCo, held to
 The coordinates are those of the prediction, `z = (x, y, phi, theta1, theta2)`: two slides and a hinge for the object,
 a hinge for each finger. Fingers have inertia J about their joint (and their centre of mass on it, so that gravity acts
 on the object alone, as in eqs. 1-3), viscous friction B and dry friction D. No contact formation is assumed: all pairs
-of features that may touch (`contacts.every_contact`) are pairs of shapes that MuJoCo tests at every step. The shapes
+of features that may touch (`contact_set.contact_candidates`) are pairs of shapes that MuJoCo tests at every step. The shapes
 make MuJoCo's distances equal the C-functions:
 
 - an object vertex and a fingertip are dots, spheres of radius `r`, a hundred-thousandth of the object's;
@@ -15,7 +15,7 @@ make MuJoCo's distances equal the C-functions:
 
 A pair thus touches at one point of the plane. If `a_free` is the acceleration of the gap `C` without the contact, then
 
-    C_ddot = (1 - d) a_free - d (b C_dot + k C),    b = 2 / (d t_c),  k = 1 / (d t_c^2)        (`Softness`)
+    C_ddot = (1 - d) a_free - d (b C_dot + k C),    b = 2 / (d t_c),  k = 1 / (d t_c^2)        (`ContactCompliance`)
 
 critically damped, so that a steady load sags by `(1 - d) a_free t_c^2`. Friction obeys Coulomb's law with the link's
 coefficient (`coulomb`), or, much faster where many models are rolled out together, MuJoCo's convex one.
@@ -32,20 +32,20 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from wholearm_jax.model.contact_kinematics import every_contact
-from wholearm_jax.model.scene import EDGE, LINKS, VERTEX, Scene, body, contact_name, parse_contact
+from wholearm_jax.model.contact_kinematics import contact_candidates
+from wholearm_jax.model.scene import EDGE, LINKS, VERTEX, Scene, rigid_body, contact_name, parse_contact
 
-DOT = 1e-5  # radius of a dot [object radii]: far above rounding, its lever arm far below any tolerance
-NEAR = 1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
-THICK = 0.2  # slabs, and all shapes in depth [object radii]
+POINT_RADIUS = 1e-5  # radius of a dot [object radii]: far above rounding, its lever arm far below any tolerance
+PAIR_DISTANCE = 1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
+HALF_SPACE_DEPTH = 0.2  # slabs, and all shapes in depth [object radii]
 
 
 @dataclass(frozen=True)
-class Softness:
+class ContactCompliance:
     """How contacts give way.
 
     `time_constant` t_c of the gap is in time steps (MuJoCo resolves no fewer than two), `impedance` is d in (0, 1).
-    `friction` is Coulomb's law (`coulomb.advance`), for which the rest has no meaning, or MuJoCo's own, `"convex"`:
+    `friction` is Coulomb's law (`coulomb.step`), for which the rest has no meaning, or MuJoCo's own, `"convex"`:
     an elliptic cone in which slip dies out at the rate `b_f = 1 / (slip_constant * time step)` while friction holds;
     `slip_stiffness` is MuJoCo's `impratio`.
 
@@ -65,12 +65,12 @@ class Softness:
     slip_stiffness: float = 100.0
 
 
-CONVEX = Softness(impedance=0.5, friction="convex")
+CONVEX = ContactCompliance(impedance=0.5, friction="convex")
 """MuJoCo's own friction, at a compromise between chatter and missing impulses."""
 
 
 @dataclass(frozen=True)
-class FreeBodies:
+class MujocoModel:
     """A compiled model, the names of its contacts, and what Coulomb's friction needs of both.
 
     `pair[geom1, geom2]` is the row of `names` that two shapes belong to (-1: none); `toward[row]` is 1
@@ -87,13 +87,13 @@ class FreeBodies:
     friction: Float[np.ndarray, "rows"]
     joint: Float[np.ndarray, "2 2"]
     mobility: Float[np.ndarray, "5"]
-    softness: Softness
+    softness: ContactCompliance
     xml: str
 
 
-def free_bodies(scene: Scene, timestep: float, softness: Softness = Softness()) -> FreeBodies:
+def build_mujoco_model(scene: Scene, timestep: float, softness: ContactCompliance = ContactCompliance()) -> MujocoModel:
     """Build the model of a scene for time steps of `timestep` [s]."""
-    solid = jax.tree.map(np.asarray, body(scene.object))
+    solid = jax.tree.map(np.asarray, rigid_body(scene.object))
     size = float(np.sqrt((solid.vertices[: solid.count] ** 2).sum(1).max()))
     spec = _world(scene, timestep, softness)
     _add_object(spec, solid, size)
@@ -110,7 +110,7 @@ def free_bodies(scene: Scene, timestep: float, softness: Softness = Softness()) 
         toward[row] = 1 if second == model.geom(ours).id else -1
     link = np.array([parse_contact(name)[0] for name in rows])
     inertia = np.array([solid.mass, solid.mass, solid.inertia, *np.asarray(scene.hand.inertia)])
-    return FreeBodies(
+    return MujocoModel(
         model=model,
         names=tuple(rows),
         pair=pair,
@@ -155,9 +155,9 @@ def _add_object(spec, solid, size):
         body_.add_joint(name=name, type=getattr(mujoco.mjtJoint, f"mjJNT_{kind}"), axis=axis)
     corners = solid.vertices[: solid.count]
     for k, corner in enumerate(corners):
-        _add_geom(body_, f"v{k}", "SPHERE", [DOT * size, 0, 0], [*corner, 0])
-    for k, wedge in enumerate(_wedges(corners, DOT * size)):
-        points = [[*p, side * THICK * size / 2] for side in (-1, 1) for p in wedge]
+        _add_geom(body_, f"v{k}", "SPHERE", [POINT_RADIUS * size, 0, 0], [*corner, 0])
+    for k, wedge in enumerate(_wedges(corners, POINT_RADIUS * size)):
+        points = [[*p, side * HALF_SPACE_DEPTH * size / 2] for side in (-1, 1) for p in wedge]
         spec.add_mesh(name=f"e{k}", uservert=np.ravel(points))
         _add_geom(body_, f"e{k}", "MESH", [0, 0, 0], [0, 0, 0], meshname=f"e{k}")
 
@@ -165,7 +165,7 @@ def _add_object(spec, solid, size):
 def _add_hand(spec, hand, size):
     """The palm, and two fingers with a motor each; the tip is a dot at the end of the contact edge."""
     left, right = float(hand.joint[1, 0]), float(hand.joint[0, 0])
-    thick, dot = THICK * size, DOT * size
+    thick, dot = HALF_SPACE_DEPTH * size, POINT_RADIUS * size
     _add_slab(spec.worldbody, "palm", left, right, -dot, -1.0, thick)
     for k, (name, side) in enumerate(zip(LINKS[1:], (1.0, -1.0), strict=True)):
         length, offset = float(hand.length[k]), float(hand.offset[k])
@@ -201,7 +201,7 @@ def _add_geom(owner, name, kind, size, position, **more):
 
 def _add_pairs(spec, solid, size, timestep, softness):
     """Declare all pairs that may touch; name -> (row, the object's shape, the hand's shape)."""
-    pairs, rows = every_contact(len(solid.vertices)), {}
+    pairs, rows = contact_candidates(len(solid.vertices)), {}
     columns = (np.asarray(a).tolist() for a in (pairs.link, pairs.kind, pairs.feature))
     d, b = softness.impedance, 1 / (softness.slip_constant * timestep)
     for link, kind, feature in zip(*columns, strict=True):
@@ -216,7 +216,7 @@ def _add_pairs(spec, solid, size, timestep, softness):
             geomname1=ours,
             geomname2=other,
             condim=3,
-            margin=NEAR * size,
+            margin=PAIR_DISTANCE * size,
             friction=[float(solid.friction[link])] * 2 + [0, 0, 0],
             solref=[softness.time_constant * timestep, 1.0],
             solreffriction=[0.0, -b * d],

@@ -1,4 +1,4 @@
-r"""Execute: a torque schedule driven open loop through `free_bodies`, and what became of it against the prediction.
+r"""Execute: a torque schedule driven open loop through `build_mujoco_model`, and what became of it against the prediction.
 
 The object is placed at the projected start of the plan's first wire, at rest, every gap 0; nothing settles before the
 torque begins. Each step holds the torque of its middle. The plan succeeded if at its end the object stands where the
@@ -24,11 +24,11 @@ from jaxtyping import Bool, Float
 from wholearm_jax.core.status import Status
 from wholearm_jax.core.validation import require_positive
 from wholearm_jax.execution.coulomb_friction import advance
-from wholearm_jax.execution.mujoco_model import FreeBodies, Softness, free_bodies
-from wholearm_jax.model.contact_kinematics import contacts, frames
-from wholearm_jax.model.scene import Body, Formation, Hand, Scene, body, formation, pair_name
-from wholearm_jax.model.schedule import Torque
-from wholearm_jax.phases.phase import destination
+from wholearm_jax.execution.mujoco_model import MujocoModel, ContactCompliance, build_mujoco_model
+from wholearm_jax.model.contact_kinematics import contact_set, contact_kinematics
+from wholearm_jax.model.scene import RigidBody, ContactFormation, Hand, Scene, rigid_body, contact_formation, feature_pair
+from wholearm_jax.model.schedule import TorqueSchedule
+from wholearm_jax.phases.phase import target_configuration
 from wholearm_jax.phases.result import Result
 from wholearm_jax.phases.sampling import trajectory
 
@@ -43,7 +43,7 @@ class Tolerance(NamedTuple):
     angle: float = 0.01
 
 
-class Ending(enum.Enum):
+class ExecutionOutcome(enum.Enum):
     """What became of an execution."""
 
     OK = "ok"
@@ -61,7 +61,7 @@ class Event(NamedTuple):
     executed: float | None
 
 
-class Course(NamedTuple):
+class ExecutedMotion(NamedTuple):
     """States and contacts over time, SI units. `cn`, `ct` act on the object, 0 without contact; `touch` by `TOUCH`."""
 
     time: Float[np.ndarray, "samples"]
@@ -83,12 +83,12 @@ class Execution:
     """
 
     prediction: Result
-    course: Course
-    expected: Course
+    course: ExecutedMotion
+    expected: ExecutedMotion
     names: tuple[str, ...]
     target: Float[np.ndarray, "5"]
     tolerance: Tolerance
-    ending: Ending
+    ending: ExecutionOutcome
     creep: float
     open_at_end: tuple[str, ...]
     events: tuple[Event, ...]
@@ -98,7 +98,7 @@ class Execution:
     @property
     def planned(self) -> tuple[str, ...]:
         """The contacts of all phases, each once."""
-        return tuple(dict.fromkeys(pair_name(name) for phase in self.prediction.phases for name in phase.contacts))
+        return tuple(dict.fromkeys(feature_pair(name) for phase in self.prediction.phases for name in phase.contacts))
 
     @property
     def position_error(self) -> float:
@@ -115,7 +115,7 @@ class Execution:
         """What became of the execution, in one line."""
         off = f"{1e3 * self.position_error:.3g} mm and {abs(self.angle_error):.2g} rad from the predicted end"
         why = f" at {', '.join(self.open_at_end)}" if self.open_at_end else ""
-        if self.ending is Ending.DIVERGED:
+        if self.ending is ExecutionOutcome.DIVERGED:
             crept = f"contacts crept {1e3 * self.creep:.3g} mm"
             why = f" ({crept if np.isfinite(self.creep) else 'MuJoCo gave up'}: take a shorter time step)"
         return f"{self.ending.value}{why}, {off}"
@@ -123,14 +123,14 @@ class Execution:
     def force(self, contact: str, times=None) -> Float[np.ndarray, "times"]:
         """A contact's executed normal force [N] at given times, by default those of `expected`."""
         times = self.expected.time if times is None else times
-        return np.interp(times, self.course.time, self.course.cn[:, self.names.index(pair_name(contact))])
+        return np.interp(times, self.course.time, self.course.cn[:, self.names.index(feature_pair(contact))])
 
 
 def execute(
     prediction: Result,
     *,
     timestep: float = 2e-4,
-    softness: Softness = Softness(),
+    softness: ContactCompliance = ContactCompliance(),
     tolerance: Tolerance = Tolerance(),
 ) -> Execution:
     """Drive the free bodies by a predicted plan's torque schedule, from its start to its end.
@@ -142,10 +142,10 @@ def execute(
     scene = prediction.scene
     require_wires(prediction)
     times, step = clock(scene, timestep)
-    bodies = free_bodies(scene, step, softness)
-    course, creep = drive(bodies, scene, start_of(prediction), motor_torques(prediction.torque, times, step), step)
+    bodies = build_mujoco_model(scene, step, softness)
+    course, creep = run_schedule(bodies, scene, start_of(prediction), motor_torques(prediction.torque, times, step), step)
     expected, target = _expected(prediction, bodies.names), target_of(prediction)
-    ending, lost = judge(scene, course.z[-1], target, tolerance, creep)
+    ending, lost = assess_execution(scene, course.z[-1], target, tolerance, creep)
     return Execution(
         prediction=prediction,
         course=course,
@@ -176,7 +176,7 @@ def clock(scene: Scene, timestep: float) -> tuple[Float[np.ndarray, "steps"], fl
     return np.arange(count) * (total / count), total / count
 
 
-def motor_torques(schedule: Torque, begins: Float[np.ndarray, "steps"], step: float) -> Float[np.ndarray, "steps 2"]:
+def motor_torques(schedule: TorqueSchedule, begins: Float[np.ndarray, "steps"], step: float) -> Float[np.ndarray, "steps 2"]:
     """The torque [N m] that each step of length `step` [s] holds: that at its middle."""
     times, values = np.asarray(schedule.times), np.asarray(schedule.values)
     middle = begins + step / 2
@@ -186,7 +186,7 @@ def motor_torques(schedule: Torque, begins: Float[np.ndarray, "steps"], step: fl
 def start_of(prediction: Result) -> Float[np.ndarray, "5"]:
     """The projected start of the plan's first wire."""
     traced = prediction.phases[0].traced
-    radius = np.hypot(*np.asarray(body(prediction.scene.object).vertices).T).max()
+    radius = np.hypot(*np.asarray(rigid_body(prediction.scene.object).vertices).T).max()
     return np.asarray(traced.wire.start) * np.array([radius, radius, 1.0, 1.0, 1.0])
 
 
@@ -194,18 +194,18 @@ def target_of(prediction: Result) -> Float[np.ndarray, "5"]:
     """Where the plan ends: its last phase's destination, or the predicted end where it need not stand still there."""
     last = prediction.phases[-1]
     moving = last.arrive in ("moving", "caught") and prediction.status is Status.OK
-    end = trajectory(prediction, 2)[-1].z[-1] if moving else destination(prediction.scene.phases[-1], last.traced)
+    end = trajectory(prediction, 2)[-1].z[-1] if moving else target_configuration(prediction.scene.phases[-1], last.traced)
     return np.asarray(end)
 
 
-def drive(bodies: FreeBodies, scene: Scene, start, torques, timestep: float) -> tuple[Course, float]:
-    """The course of `follow`, and how far contacts crept."""
-    z, z_dot, forces, creep = follow(bodies, start, torques)
+def run_schedule(bodies: MujocoModel, scene: Scene, start, torques, timestep: float) -> tuple[ExecutedMotion, float]:
+    """The course of `trace_phase_path`, and how far contacts crept."""
+    z, z_dot, forces, creep = rollout(bodies, start, torques)
     times = np.arange(len(z)) * timestep
-    return Course(times, z, z_dot, forces[..., 0], forces[..., 1], touching(scene, bodies.names, z)), creep
+    return ExecutedMotion(times, z, z_dot, forces[..., 0], forces[..., 1], touching_contacts_at(scene, bodies.names, z)), creep
 
 
-def follow(bodies: FreeBodies, start, torques):
+def rollout(bodies: MujocoModel, start, torques):
     """Step the model from rest at `start`: `z`, `z_dot` and forces `(c_n, c_t)`; row `k` is the state before step `k`.
 
     The last is how far contacts slipped against Coulomb's law in all steps together, at most [m]; infinite where
@@ -226,12 +226,12 @@ def follow(bodies: FreeBodies, start, torques):
     return z, z_dot, forces, np.inf if gave_up else creep
 
 
-def stepper(bodies: FreeBodies) -> Callable:
-    """`coulomb.advance`, or the same with MuJoCo's own friction."""
+def stepper(bodies: MujocoModel) -> Callable:
+    """`coulomb.step`, or the same with MuJoCo's own friction."""
     return advance if bodies.softness.friction == "coulomb" else _advance
 
 
-def _advance(bodies: FreeBodies, data: mujoco.MjData, torque, before):
+def _advance(bodies: MujocoModel, data: mujoco.MjData, torque, before):
     data.ctrl[:] = torque
     mujoco.mj_step(bodies.model, data)  # its contacts are those of the state before the step
     forces = np.zeros_like(before)
@@ -239,7 +239,7 @@ def _advance(bodies: FreeBodies, data: mujoco.MjData, torque, before):
     return forces, 0.0
 
 
-def _read_forces(bodies: FreeBodies, data: mujoco.MjData, into) -> None:
+def _read_forces(bodies: MujocoModel, data: mujoco.MjData, into) -> None:
     """Add the forces of all contacts, `(c_n, c_t)` on the object, to their pairs' rows."""
     contact = data.contact
     if not len(contact.dist):
@@ -257,46 +257,46 @@ def _read_forces(bodies: FreeBodies, data: mujoco.MjData, into) -> None:
     np.add.at(into[:, 1], row[acting], force[:, 0] * normal[:, 1] - force[:, 1] * normal[:, 0])
 
 
-def touching(scene: Scene, names: tuple[str, ...], z, slack: float | None = None) -> np.ndarray:
-    """Which contacts are closed to within `slack` [m] (default: `TOUCH`) at configurations `z (samples, 5)`."""
-    solid = body(scene.object)
+def touching_contacts_at(scene: Scene, names: tuple[str, ...], z, slack: float | None = None) -> np.ndarray:
+    """Which contacts are closed to within `force_slack` [m] (default: `TOUCH`) at configurations `z (samples, 5)`."""
+    solid = rigid_body(scene.object)
     slack = TOUCH * float(np.hypot(*np.asarray(solid.vertices).T).max()) if slack is None else slack
-    return np.asarray(_touching(solid, scene.hand, formation(names), z, slack))
+    return np.asarray(_touching(solid, scene.hand, contact_formation(names), z, slack))
 
 
 @jax.jit
-def _touching(solid: Body, hand: Hand, pairs: Formation, z, slack):
-    several = contacts(solid, hand, pairs)
-    at = jax.vmap(frames, (None, 0))(several, z)
+def _touching(solid: RigidBody, hand: Hand, pairs: ContactFormation, z, slack):
+    several = contact_set(solid, hand, pairs)
+    at = jax.vmap(contact_kinematics, (None, 0))(several, z)
     on_feature = (at.along > several.lower - slack) & (at.along < several.upper + slack)
     return (jnp.abs(at.gap) < slack) & on_feature  # far behind an edge's line the gap is negative, and nothing touches
 
 
-def judge(scene: Scene, z, target, tolerance: Tolerance, creep: float = 0.0) -> tuple[Ending, tuple[str, ...]]:
+def assess_execution(scene: Scene, z, target, tolerance: Tolerance, creep: float = 0.0) -> tuple[ExecutionOutcome, tuple[str, ...]]:
     """What became of an execution that ended at `z` and crept so far, and which contacts of the last phase are open."""
-    names = tuple(map(pair_name, scene.phases[-1].formation.names))
-    closed = touching(scene, names, z[None], tolerance.position)[0]
+    names = tuple(map(feature_pair, scene.phases[-1].formation.names))
+    closed = touching_contacts_at(scene, names, z[None], tolerance.position)[0]
     lost = tuple(name for name, there in zip(names, closed, strict=True) if not there)
     off = np.abs(z - target)
     near = np.hypot(*off[:2]) <= tolerance.position and off[2] <= tolerance.angle
     if not creep <= tolerance.position:
-        return Ending.DIVERGED, lost
-    return (Ending.CONTACT_LOST if lost else Ending.OK if near else Ending.ASTRAY), lost
+        return ExecutionOutcome.DIVERGED, lost
+    return (ExecutionOutcome.CONTACT_LOST if lost else ExecutionOutcome.OK if near else ExecutionOutcome.ASTRAY), lost
 
 
-def _expected(prediction: Result, names: tuple[str, ...]) -> Course:
+def _expected(prediction: Result, names: tuple[str, ...]) -> ExecutedMotion:
     """The prediction as a course over all `names`."""
     phases = []
     for phase, at in zip(prediction.phases, trajectory(prediction, SAMPLES), strict=False):
         cn, ct = np.zeros((2, SAMPLES, len(names)))
-        columns = [names.index(pair_name(name)) for name in phase.contacts]
+        columns = [names.index(feature_pair(name)) for name in phase.contacts]
         cn[:, columns], ct[:, columns] = at.cn[:, : len(columns)], at.ct[:, : len(columns)]
         time, z, z_dot = (np.asarray(a) for a in (at.time, at.z, at.z_dot))
-        phases.append(Course(time, z, z_dot, cn, ct, touching(prediction.scene, names, z)))
-    return Course(*(np.concatenate(field) for field in zip(*phases, strict=True)))
+        phases.append(ExecutedMotion(time, z, z_dot, cn, ct, touching_contacts_at(prediction.scene, names, z)))
+    return ExecutedMotion(*(np.concatenate(field) for field in zip(*phases, strict=True)))
 
 
-def _events(names: tuple[str, ...], expected: Course, course: Course) -> tuple[Event, ...]:
+def _events(names: tuple[str, ...], expected: ExecutedMotion, course: ExecutedMotion) -> tuple[Event, ...]:
     """Changes of contact in the prediction, each beside the nearest like one in the execution; then what is left."""
     found, events = _changes(course), []
     for (contact, made), whens in _changes(expected).items():
@@ -310,7 +310,7 @@ def _events(names: tuple[str, ...], expected: Course, course: Course) -> tuple[E
     return tuple(sorted(events, key=lambda e: e.executed if e.predicted is None else e.predicted))
 
 
-def _changes(course: Course) -> dict[tuple[int, bool], list[float]]:
+def _changes(course: ExecutedMotion) -> dict[tuple[int, bool], list[float]]:
     """(contact, made) -> the times at which a contact is made (True) or opened (False)."""
     found: dict[tuple[int, bool], list[float]] = {}
     for row, contact in np.argwhere(course.touch[1:] != course.touch[:-1]):

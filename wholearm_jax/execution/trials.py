@@ -23,23 +23,23 @@ from jaxtyping import Array, Float
 from joblib import Parallel, delayed
 
 from wholearm_jax.core.validation import require_positive
-from wholearm_jax.ensembles.proportion import wilson
-from wholearm_jax.execution.mujoco_model import FreeBodies, Softness, free_bodies
+from wholearm_jax.ensembles.proportion import wilson_interval
+from wholearm_jax.execution.mujoco_model import MujocoModel, ContactCompliance, build_mujoco_model
 from wholearm_jax.execution.rollout import (
-    Ending,
+    ExecutionOutcome,
     Tolerance,
     clock,
-    follow,
-    judge,
+    rollout,
+    assess_execution,
     motor_torques,
     require_wires,
     start_of,
     target_of,
 )
-from wholearm_jax.model.contact_kinematics import gaps, normal_rows
-from wholearm_jax.model.mechanics import system
-from wholearm_jax.model.polygon import stays_simple
-from wholearm_jax.model.scene import Formation, Scene, body
+from wholearm_jax.model.contact_kinematics import gaps, normal_jacobian
+from wholearm_jax.model.mechanics import scaled_mechanics
+from wholearm_jax.model.polygon import remains_simple
+from wholearm_jax.model.scene import ContactFormation, Scene, rigid_body
 from wholearm_jax.phases.result import Result
 
 
@@ -53,7 +53,7 @@ class Amounts(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Perturbed:
+class PerturbedRun:
     """One execution: factors and shifts drawn, where the object ended, and what that counts as."""
 
     friction: Float[np.ndarray, "3"]
@@ -61,25 +61,25 @@ class Perturbed:
     end: Float[np.ndarray, "5"]
     position_error: float
     angle_error: float
-    ending: Ending
+    ending: ExecutionOutcome
 
 
 @dataclass(frozen=True)
-class Robustness:
+class TrialsResult:
     """Many perturbed executions; `interval` is the success rate's 95 % confidence interval (Wilson's)."""
 
     amounts: Amounts
     seed: int
     tolerance: Tolerance
-    runs: tuple[Perturbed, ...]
+    runs: tuple[PerturbedRun, ...]
 
     @property
     def successes(self) -> int:
-        return sum(run.ending is Ending.OK for run in self.runs)
+        return sum(run.ending is ExecutionOutcome.OK for run in self.runs)
 
     @property
     def interval(self) -> tuple[float, float]:
-        return wilson(self.successes, len(self.runs))
+        return wilson_interval(self.successes, len(self.runs))
 
     @property
     def message(self) -> str:
@@ -90,18 +90,18 @@ class Robustness:
         return f"{self.successes} of {len(self.runs)} perturbed executions succeed: {share:.1f} %, {span}"
 
 
-def perturb(
+def run_trials(
     prediction: Result,
     count: int,
     amounts: Amounts,
     *,
     seed: int = 0,
     timestep: float = 2e-4,
-    softness: Softness = Softness(),
+    softness: ContactCompliance = ContactCompliance(),
     tolerance: Tolerance = Tolerance(),
     workers: int | None = None,
-    callback: Callable[[Perturbed], None] | None = None,
-) -> Robustness:
+    callback: Callable[[PerturbedRun], None] | None = None,
+) -> TrialsResult:
     """Execute `count` perturbed copies of a plan in `workers` processes (default: one for each processor).
 
     `callback` sees each as it is done, in their order. Raises ValueError as `require_wires` and `require_objects` do,
@@ -119,16 +119,16 @@ def perturb(
 
     def copies():
         for scene, shift in zip(scenes, shifts, strict=True):
-            yield free_bodies(scene, step, softness), start_near(scene, nominal, shift)
+            yield build_mujoco_model(scene, step, softness), start_near(scene, nominal, shift)
 
-    found = roll_out(copies(), torques, min(workers or os.cpu_count() or 1, count))
+    found = rollout_in_parallel(copies(), torques, min(workers or os.cpu_count() or 1, count))
     runs = []
     for scene, (end, creep) in zip(scenes, found, strict=True):
-        ending, _ = judge(scene, end, target, tolerance, creep)
+        ending, _ = assess_execution(scene, end, target, tolerance, creep)
         runs.append(_summary(prediction.scene, scene, end, target, ending))
         if callback is not None:
             callback(runs[-1])
-    return Robustness(amounts, seed, tolerance, tuple(runs))
+    return TrialsResult(amounts, seed, tolerance, tuple(runs))
 
 
 def require_objects(scene: Scene, amounts: Amounts) -> None:
@@ -136,7 +136,7 @@ def require_objects(scene: Scene, amounts: Amounts) -> None:
     if not 0 <= amounts.friction <= 1 or not 0 <= amounts.mass < 1:
         raise ValueError("friction, mass: shares of up to 1, of the mass less than 1")
     outline = np.asarray(scene.object.vertices)[: int(scene.object.count)]
-    if not stays_simple(outline, np.full(len(outline), np.sqrt(2) * amounts.geometry)):
+    if not remains_simple(outline, np.full(len(outline), np.sqrt(2) * amounts.geometry)):
         raise ValueError(f"geometry {amounts.geometry:g}: too much, edges of the polygon could cross")
 
 
@@ -163,34 +163,34 @@ def start_near(scene: Scene, z, shift) -> Float[np.ndarray, "5"]:
 
 
 @jax.jit
-def _touch_down(shape, hand, gravity, formation: Formation, z, shift) -> Float[Array, "5"]:
-    mechanics = system(body(shape), hand, gravity, formation)
+def _touch_down(shape, hand, gravity, formation: ContactFormation, z, shift) -> Float[Array, "5"]:
+    mechanics = scaled_mechanics(rigid_body(shape), hand, gravity, formation)
     displaced = z / mechanics.configuration_unit + jnp.zeros(5).at[:3].set(shift / mechanics.length)
 
     def closer(_, z):
-        rows = normal_rows(mechanics.contacts, z)
+        rows = normal_jacobian(mechanics.contacts, z)
         return z - rows.T @ jnp.linalg.solve(rows @ rows.T, gaps(mechanics.contacts, z))
 
     return jax.lax.fori_loop(0, 20, closer, displaced) * mechanics.configuration_unit
 
 
-def roll_out(
-    copies: Iterable[tuple[FreeBodies, Float[np.ndarray, "5"]]], torques, workers: int
+def rollout_in_parallel(
+    copies: Iterable[tuple[MujocoModel, Float[np.ndarray, "5"]]], torques, workers: int
 ) -> Iterator[tuple[Float[np.ndarray, "5"], float]]:
-    """Where free bodies end, driven from rest at their starts, and how far contacts crept (`execution.follow`)."""
+    """Where free bodies end, driven from rest at their starts, and how far contacts crept (`execution.trace_phase_path`)."""
     each = (delayed(_end)(bodies, start, torques) for bodies, start in copies)
     return Parallel(n_jobs=workers, return_as="generator")(each)  # pyright: ignore[reportReturnType]
 
 
-def _end(bodies: FreeBodies, start, torques) -> tuple[Float[np.ndarray, "5"], float]:
-    z, _, _, creep = follow(bodies, start, torques)
+def _end(bodies: MujocoModel, start, torques) -> tuple[Float[np.ndarray, "5"], float]:
+    z, _, _, creep = rollout(bodies, start, torques)
     return z[-1], creep
 
 
-def _summary(scene: Scene, changed: Scene, end, target, ending: Ending) -> Perturbed:
+def _summary(scene: Scene, changed: Scene, end, target, ending: ExecutionOutcome) -> PerturbedRun:
     off = end - target
     was, now = (np.asarray(one.object.friction) for one in (scene, changed))
-    return Perturbed(
+    return PerturbedRun(
         friction=np.where(was > 0, now / np.where(was > 0, was, 1.0), 1.0),
         mass=float(changed.object.mass / scene.object.mass),
         end=end,

@@ -17,7 +17,7 @@ import numpy as np
 import zarr
 from zarr.errors import GroupNotFoundError
 
-from wholearm_jax.ensembles.batch import Checked
+from wholearm_jax.ensembles.batch import BatchResult
 
 KIND = "wholearm_jax check"
 # Status, contact and phase numbers are small; -1 marks "none".
@@ -75,9 +75,9 @@ class Store:
         except OSError as error:
             raise StoreError(f"{self.path}: cannot be written: {error.strerror or error}") from None
 
-    def read(self, number: int) -> Checked:
+    def read(self, number: int) -> BatchResult:
         """A chunk's results."""
-        return Checked(*(np.asarray(self.array(name)[self.rows(number)]) for name in Checked._fields))
+        return BatchResult(*(np.asarray(self.array(name)[self.rows(number)]) for name in BatchResult._fields))
 
 
 def identity(count: int, chunk: int, **settings: Any) -> dict[str, Any]:

@@ -12,9 +12,9 @@ from zlib import error as ZlibError
 import jax
 import numpy as np
 
-from wholearm_jax.ensembles.batch import Given
+from wholearm_jax.ensembles.batch import SceneBatch
 from wholearm_jax.files.scene_toml import SceneError
-from wholearm_jax.model.polygon import first_flaw
+from wholearm_jax.model.polygon import find_defect
 from wholearm_jax.model.scene import Polygon, Scene
 
 _UNREADABLE = (OSError, ValueError, KeyError, AttributeError, TypeError, EOFError, BadZipFile, ZlibError)
@@ -29,7 +29,7 @@ def how_many(path: Path) -> int:
         return 0
 
 
-def read_polygons(path: Path, scene: Scene) -> Given:
+def read_polygons(path: Path, scene: Scene) -> SceneBatch:
     """The scene with each polygon of a file. Raises `SceneError` naming the file, the entry and what is wrong."""
     try:
         with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
@@ -58,7 +58,7 @@ def read_polygons(path: Path, scene: Scene) -> Given:
     _named_vertices(path, scene, count)
     shape = Polygon(vertices=vertices, count=count, mass=mass, friction=friction)  # pyright: ignore
     alike = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (many, *np.shape(leaf))), scene)
-    return Given(Scene(scene.title, alike.gravity, alike.hand, shape, alike.start, alike.phases))
+    return SceneBatch(Scene(scene.title, alike.gravity, alike.hand, shape, alike.start, alike.phases))
 
 
 def _outlines(path, vertices, count) -> None:
@@ -69,7 +69,7 @@ def _outlines(path, vertices, count) -> None:
         finite = np.isfinite(chosen).all((1, 2))
         if not finite.all():
             raise SceneError(f"{path}: vertices[{which[np.argmin(finite)]}]: not finite")
-        flaw = first_flaw(np.asarray(chosen, float))
+        flaw = find_defect(np.asarray(chosen, float))
         if flaw is not None:
             raise SceneError(f"{path}: vertices[{which[flaw[0]]}]: {flaw[1]}")
 

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wholearm_jax.core.atomic_files import write_whole
+from wholearm_jax.core.atomic_files import write_atomically
 from wholearm_jax.files.scene_toml import CONSTRAINTS, SceneError, to_dict
 from wholearm_jax.model.scene import COORDINATES
-from wholearm_jax.model.schedule import Torque, torque
+from wholearm_jax.model.schedule import TorqueSchedule, torque_schedule
 from wholearm_jax.phases.result import Result
 from wholearm_jax.phases.sampling import trajectory
 
 if TYPE_CHECKING:  # running them needs MuJoCo, writing does not
     from wholearm_jax.execution.rollout import Execution
-    from wholearm_jax.execution.trials import Robustness
+    from wholearm_jax.execution.trials import TrialsResult
 
 TORQUE_COLUMNS = ("t", "tau1", "tau2")
 _CONTACTS = range(1, CONSTRAINTS + 1)
@@ -32,7 +32,7 @@ TRAJECTORY_COLUMNS = (
 )
 
 
-def read_torque(path: str | Path) -> Torque:
+def read_torque(path: str | Path) -> TorqueSchedule:
     """Read a torque schedule (header `t,tau1,tau2`; s, N m).
 
     Raises `SceneError` naming the file, the line and the cause.
@@ -73,12 +73,12 @@ def read_torque(path: str | Path) -> Torque:
         numbers.append(values)
     table = np.asarray(numbers).reshape(-1, 3)
     try:
-        return torque(table[:, 0], table[:, 1:])
+        return torque_schedule(table[:, 0], table[:, 1:])
     except ValueError as error:
         raise SceneError(f"{path}: line {len(rows)}: the file ends here: {error}") from None
 
 
-def write_torque(schedule: Torque, path: str | Path) -> None:
+def write_torque(schedule: TorqueSchedule, path: str | Path) -> None:
     """Write a torque schedule (header `t,tau1,tau2`; s, N m) with every digit. Raises `OSError`.
 
     >>> wa.write_torque(wa.torque([0.0, 2.0], [[0.5, -0.2], [0.5, -0.4]]), folder / "torque.csv")
@@ -88,7 +88,7 @@ def write_torque(schedule: Torque, path: str | Path) -> None:
     2.0,0.5,-0.4
     """
     table = np.column_stack([np.asarray(schedule.times), np.asarray(schedule.values)])
-    write_whole(path, _csv(TORQUE_COLUMNS, table.tolist()))
+    write_atomically(path, _csv(TORQUE_COLUMNS, table.tolist()))
 
 
 def write_trajectory(result: Result, path: str | Path, samples: int = 201) -> None:
@@ -99,7 +99,7 @@ def write_trajectory(result: Result, path: str | Path, samples: int = 201) -> No
         for k, time in enumerate(np.asarray(course.time)):
             numbers = [v for block in blocks for v in np.asarray(block)[k].tolist()]
             rows.append([float(time), phase.name, *("" if math.isnan(v) else v for v in numbers)])
-    write_whole(path, _csv(TRAJECTORY_COLUMNS, rows))
+    write_atomically(path, _csv(TRAJECTORY_COLUMNS, rows))
 
 
 def summary(result: Result, *, bounds: tuple[float, ...] | None = None, **more: Any) -> dict[str, Any]:
@@ -127,7 +127,7 @@ def summary(result: Result, *, bounds: tuple[float, ...] | None = None, **more: 
     return _plain(head) | {"phases": phases} | _plain(more) | again
 
 
-def execution_summary(execution: Execution, robustness: Robustness | None = None, **more: Any) -> dict[str, Any]:
+def execution_summary(execution: Execution, robustness: TrialsResult | None = None, **more: Any) -> dict[str, Any]:
     """What became of an execution, and of its perturbed copies, as the file `execution.json` holds it."""
     head = {"status": execution.ending.value, "message": execution.message}
     errors = {
@@ -166,7 +166,7 @@ def write_execution(execution: Execution, path: str | Path, samples: int = 201) 
     columns = [execution.names.index(name) for name in planned]
     table = np.column_stack([course.time, course.z, course.z_dot, course.cn[:, columns]])[::every]
     header = ("t", *COORDINATES, *(f"{c}_dot" for c in COORDINATES), *(f"cn {name}" for name in planned))
-    write_whole(path, _csv(header, table.tolist()))
+    write_atomically(path, _csv(header, table.tolist()))
 
 
 def discard(folder: Path) -> None:
@@ -186,7 +186,7 @@ def _remove(folder: Path, files: tuple[str, ...], figures: tuple[str, ...]) -> N
 
 def write_summary(content: dict[str, Any], path: str | Path) -> None:
     """Write a summary as JSON."""
-    write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+    write_atomically(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def _plain(row: dict[str, Any]) -> dict[str, Any]:

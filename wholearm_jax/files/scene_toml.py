@@ -21,10 +21,10 @@ from pydantic import (
     model_validator,
 )
 
-from wholearm_jax.core.arrays import array
-from wholearm_jax.core.atomic_files import write_whole
-from wholearm_jax.model.polygon import first_flaw
-from wholearm_jax.model.scene import COORDINATES, LINKS, Hand, Phase, Scene, formation, heading, parse_contact, polygon
+from wholearm_jax.core.arrays import as_device_array
+from wholearm_jax.core.atomic_files import write_atomically
+from wholearm_jax.model.polygon import find_defect
+from wholearm_jax.model.scene import COORDINATES, LINKS, Hand, Phase, Scene, contact_formation, path_target, parse_contact, polygon
 
 CONSTRAINTS = 4
 
@@ -78,7 +78,7 @@ class _Frictions(_Strict):
 
 def _polygon(vertices: list[Pair]) -> list[Pair]:
     """Refuse vertices that make no polygon."""
-    flaw = first_flaw(np.asarray(vertices)[None])
+    flaw = find_defect(np.asarray(vertices)[None])
     if flaw is not None:
         raise ValueError(flaw[1])
     return vertices
@@ -223,19 +223,19 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
     try:
         checked = _Scene.model_validate(data)
     except ValidationError as error:
-        raise SceneError(f"{source}: {explain(error)}") from None
+        raise SceneError(f"{source}: {explain_validation_error(error)}") from None
     fingers = (checked.hand.finger1, checked.hand.finger2)
     shape, friction = checked.object, checked.object.friction
     each = friction if isinstance(friction, float) else [getattr(friction, link) for link in LINKS]
     gravity = checked.gravity if isinstance(checked.gravity, tuple) else (0.0, -checked.gravity)
     return Scene(
         title=checked.title,
-        gravity=array(gravity),
-        hand=Hand(*(array([getattr(f, key) for f in fingers]) for key in Hand.__dataclass_fields__)),
+        gravity=as_device_array(gravity),
+        hand=Hand(*(as_device_array([getattr(f, key) for f in fingers]) for key in Hand.__dataclass_fields__)),
         object=polygon(shape.vertices, shape.mass, each, shape.inertia, shape.center_of_mass),
-        start=array([getattr(checked.start, c) for c in COORDINATES]),
+        start=as_device_array([getattr(checked.start, c) for c in COORDINATES]),
         phases=tuple(
-            Phase(p.name, formation(p.contacts), heading(p.toward, p.until), array(p.duration, float), _arrive(p))
+            Phase(p.name, contact_formation(p.contacts), path_target(p.toward, p.until), as_device_array(p.duration, float), _arrive(p))
             for p in checked.phase
         ),
     )
@@ -258,7 +258,7 @@ _WORDS = {
 }
 
 
-def explain(error: ValidationError) -> str:
+def explain_validation_error(error: ValidationError) -> str:
     """One complaint in one line: the key, what is wrong, and for an unknown key the nearest known one.
 
     The first complaint, but an unknown key before any other: what is missing is then often only misspelt.
@@ -335,4 +335,4 @@ def save(scene: Scene, path: str | Path) -> None:
     >>> wa.load(folder / "mine.toml").title
     'hexagon'
     """
-    write_whole(path, tomli_w.dumps(to_dict(scene)))
+    write_atomically(path, tomli_w.dumps(to_dict(scene)))

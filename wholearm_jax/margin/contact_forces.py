@@ -21,21 +21,21 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.lookup import pick
-from wholearm_jax.dynamics.path_dynamics import Table, combined, derivative, polynomial, powers
-from wholearm_jax.model.schedule import Window, torque_in
-from wholearm_jax.simulation.event_step import acceleration, single_step
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.core.lookup import take_row
+from wholearm_jax.dynamics.path_dynamics import PathDynamics, evaluate_dot, differentiate_polynomial, evaluate_polynomial, locate_panel
+from wholearm_jax.model.schedule import PhaseSchedule, torque_at
+from wholearm_jax.simulation.event_step import path_acceleration, solver_step
+from wholearm_jax.simulation.integrator import IntegratorOptions
 from wholearm_jax.simulation.phase_motion import Motion
 
-SAMPLES = 7  # places in a step at which forces are sampled before the minimum is refined
-MOST_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
-REFINED = 4  # dips refined: those that parabolas through samples put lowest
-FEW = 16  # steps sampled together
-GOLDEN = 17  # sections to a dip: Newton's step on the true motion follows
+SAMPLES_PER_STEP = 7  # places in a step at which forces are sampled before the minimum is refined
+MAX_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
+MAX_REFINED = 4  # dips refined: those that parabolas through samples put lowest
+FEW_CANDIDATES = 16  # steps sampled together
+GOLDEN_ITERATIONS = 17  # sections to a dip: Newton's step on the true motion follows
 
 
-class Score(NamedTuple):
+class MarginResult(NamedTuple):
     """The least slack of a phase: `margin` [N], its time as a share of the phase, its `s` and the number of its row in
     the formation, `contact`.
 
@@ -50,7 +50,7 @@ class Score(NamedTuple):
     lost_contact: Int[Array, ""]
 
 
-class Arcs(eqx.Module):
+class DenseOutput(eqx.Module):
     """The steps of a motion as quintics: everything that forces within step `i` depend on."""
 
     share: Float[Array, "steps 2"]
@@ -61,21 +61,21 @@ class Arcs(eqx.Module):
     live: Bool[Array, "steps"]
 
 
-def arcs(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion) -> Arcs:
+def dense_output(table: PathDynamics, seen: PhaseSchedule, duration: Float[Array, ""], motion: Motion) -> DenseOutput:
     """The steps of a motion as arcs."""
     # A step that takes no time has no speed of its own: its neighbours hold what is before it and behind.
     live = (jnp.arange(motion.held.shape[0]) < motion.count) & (motion.share[1:] > motion.share[:-1])
     share, s = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (motion.share, motion.s))
     w = jnp.stack([motion.entry_w, motion.w[1:]], axis=1)
-    each = jax.vmap(arc, (None, None, None, 0, 0, 0, 0, 0, 0))
+    each = jax.vmap(quintic_hermite, (None, None, None, 0, 0, 0, 0, 0, 0))
     quintic = each(table, seen, duration, share, s, w, motion.piece, motion.row, live & ~motion.held)
-    return Arcs(share, quintic, motion.piece, motion.row, motion.held, live)
+    return DenseOutput(share, quintic, motion.piece, motion.row, motion.held, live)
 
 
-def arc(table: Table, seen: Window, duration, share, s, w, piece, row, moving) -> Float[Array, "6"]:
+def quintic_hermite(table: PathDynamics, seen: PhaseSchedule, duration, share, s, w, piece, row, moving) -> Float[Array, "6"]:
     """The quintic Hermite arc in `xi` in [0, 1] between a step's two ends; `s` stays where nothing moves."""
     width = share[1] - share[0]
-    bend = jax.vmap(acceleration, (None, None, None, None, None, 0, 0, 0))(
+    bend = jax.vmap(path_acceleration, (None, None, None, None, None, 0, 0, 0))(
         table, seen, duration, piece, row, share, s, w
     )
     d0, d1 = jnp.where(moving, w * width, 0.0)
@@ -95,36 +95,36 @@ def arc(table: Table, seen: Window, duration, share, s, w, piece, row, moving) -
     return jnp.stack(quintic)
 
 
-def on_arc(one: Arcs, xi: Float[Array, ""]):
+def evaluate_dense(one: DenseOutput, xi: Float[Array, ""]):
     """Share, `s` and `w` at `xi` of one arc (no leading axis)."""
     width = one.share[1] - one.share[0]
-    s = polynomial(one.quintic, xi)
-    slope = polynomial(derivative(one.quintic), xi)
+    s = evaluate_polynomial(one.quintic, xi)
+    slope = evaluate_polynomial(differentiate_polynomial(one.quintic), xi)
     moving = one.live & ~one.held
     return one.share[0] + xi * width, s, jnp.where(moving, slope / jnp.where(moving, width, 1.0), 0.0)
 
 
-def force(table: Table, seen: Window, duration, piece, row, share, s, w) -> Float[Array, "slots"]:
+def contact_force(table: PathDynamics, seen: PhaseSchedule, duration, piece, row, share, s, w) -> Float[Array, "slots"]:
     """Constraint forces [N] for forward travel: `c_n`, and `c_t` in tangential rows."""
-    panel, xi = powers(table, piece, s)
+    panel, xi = locate_panel(table, piece, s)
     v = w / duration
     rest = jnp.stack([jnp.ones_like(v), v**2, v])
-    return combined(table.force, panel, xi, jnp.concatenate([rest, torque_in(seen, row, share)]))
+    return evaluate_dot(table.force, panel, xi, jnp.concatenate([rest, torque_at(seen, row, share)]))
 
 
-def slack(table: Table, forces: Float[Array, "slots"]) -> Float[Array, "slots"]:
+def force_slack(table: PathDynamics, forces: Float[Array, "slots"]) -> Float[Array, "slots"]:
     """What of constraint forces counts toward the margin [N]: `c_n`, and `mu c_n - |c_t|` in tangential rows."""
     cone = table.grip * jnp.roll(forces, 1) - jnp.abs(forces)  # a contact's normal row stands before its tangential one
     return jnp.where(table.tangential, cone, forces)
 
 
-def linear_slacks(
-    table: Table, forces: Float[Array, "slots *terms"], rolling: int = MOST_ROLLING
+def cone_facets(
+    table: PathDynamics, forces: Float[Array, "slots *terms"], rolling: int = MAX_ROLLING
 ) -> Float[Array, "rows *terms"]:
-    """Linear functions of the forces whose least is the least `slack`: both sides of each friction cone.
+    """Linear functions of the forces whose least is the least `force_slack`: both sides of each friction cone.
 
     `forces` may be coefficients, by any linear terms. Four constraints have at most two tangential rows, and so there
-    are six of these, fewer where it is known that no more than `rolling` roll; those not needed (`spare`) repeat the
+    are six of these, fewer where it is known that no more than `rolling` roll; those not needed (`is_duplicate_facet`) repeat the
     first.
     """
     column = (slice(None), *(None,) * (forces.ndim - 1))
@@ -135,70 +135,70 @@ def linear_slacks(
     return jnp.concatenate([one_side, other])
 
 
-def spare(table: Table) -> Bool[Array, "rows"]:
-    """Which of `linear_slacks` repeat another."""
+def is_duplicate_facet(table: PathDynamics) -> Bool[Array, "rows"]:
+    """Which of `cone_facets` repeat another."""
     slots = table.tangential.shape[0]
-    return jnp.arange(slots + MOST_ROLLING) >= slots + table.tangential.sum()
+    return jnp.arange(slots + MAX_ROLLING) >= slots + table.tangential.sum()
 
 
-def slacks_on(table: Table, seen: Window, duration, arc: Arcs, xi, kind=slack) -> Float[Array, "rows"]:
-    """`slack` (or `linear_slacks`) at `xi` of one arc."""
-    share, s, w = on_arc(arc, xi)
-    return kind(table, force(table, seen, duration, arc.piece, arc.row, share, s, w))
+def slacks_at(table: PathDynamics, seen: PhaseSchedule, duration, arc: DenseOutput, xi, kind=force_slack) -> Float[Array, "rows"]:
+    """`force_slack` (or `cone_facets`) at `xi` of one arc."""
+    share, s, w = evaluate_dense(arc, xi)
+    return kind(table, contact_force(table, seen, duration, arc.piece, arc.row, share, s, w))
 
 
 def sampled_slacks(
-    table: Table, seen: Window, duration, steps: Arcs, samples: int = SAMPLES, kind=slack
+    table: PathDynamics, seen: PhaseSchedule, duration, steps: DenseOutput, samples: int = SAMPLES_PER_STEP, kind=force_slack
 ) -> Float[Array, "steps samples rows"]:
-    """`slack` (or `linear_slacks`) at evenly spaced places of every step, ends included; infinite where all rests."""
+    """`force_slack` (or `cone_facets`) at evenly spaced places of every step, ends included; infinite where all rests."""
     xi = jnp.linspace(0.0, 1.0, samples, dtype=steps.quintic.dtype)
-    on = partial(slacks_on, kind=kind)
+    on = partial(slacks_at, kind=kind)
     at = jax.vmap(jax.vmap(on, (None, None, None, None, 0)), (None, None, None, 0, None))
     values = at(table, seen, duration, steps, xi)
     return jnp.where((steps.live & ~steps.held)[:, None, None], values, jnp.inf)
 
 
-def score(table: Table, seen: Window, duration: Float[Array, ""], motion: Motion, how: Integration) -> Score:
+def minimum_margin(table: PathDynamics, seen: PhaseSchedule, duration: Float[Array, ""], motion: Motion, how: IntegratorOptions) -> MarginResult:
     """The margin of a simulated phase.
 
     The quintics find the place; the force there comes from one step of the solver that ends beside it, so that the
     margin is as accurate as the integration.
     """
-    steps = arcs(table, seen, duration, motion)
-    values = _values(*stop_gradient((table, seen, duration, steps)), motion.count)
+    steps = dense_output(table, seen, duration, motion)
+    values = _sample(*stop_gradient((table, seen, duration, steps)), motion.count)
 
     def at(number):
         """What a dip in a step depends on, and its place as (step, contact)."""
         step, contact = number // values.shape[2], number % values.shape[2]
-        arc = jax.tree.map(lambda a: pick(a, step), steps)
-        return (table, seen, duration, arc, pick(motion.entry_w, step)), step, contact
+        arc = jax.tree.map(lambda a: take_row(a, step), steps)
+        return (table, seen, duration, arc, take_row(motion.entry_w, step)), step, contact
 
     def find(number):
         """How low a dip goes, and where."""
         inputs, step, contact = stop_gradient(at(number))
-        seat, reach = jnp.argmin(pick(pick(values, step).T, contact)) / (SAMPLES - 1), 1.0 / (SAMPLES - 1)
+        seat, reach = jnp.argmin(take_row(take_row(values, step).T, contact)) / (SAMPLES_PER_STEP - 1), 1.0 / (SAMPLES_PER_STEP - 1)
         low, high = jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0)
-        xi = _minimise(lambda xi: pick(slacks_on(*inputs[:4], xi), contact), low, high)
-        return _dip(inputs, how, contact, xi, low, high)
+        xi = _golden_section(lambda xi: take_row(slacks_at(*inputs[:4], xi), contact), low, high)
+        return _refine_minimum(inputs, how, contact, xi, low, high)
 
-    numbers = _lowest(_dips(values).ravel(), REFINED)
+    numbers = _lowest_samples(_candidate_minima(values).ravel(), MAX_REFINED)
     least, places = stop_gradient(jax.vmap(find)(numbers))
     best = jnp.argmin(least)
-    inputs, _, contact = at(pick(numbers, best))
-    xi = pick(places, best)
-    margin = _carried(inputs, how, contact, xi, pick(least, best))
-    share, s, _ = on_arc(inputs[3], xi)
+    inputs, _, contact = at(take_row(numbers, best))
+    xi = take_row(places, best)
+    margin = _with_envelope_derivative(inputs, how, contact, xi, take_row(least, best))
+    share, s, _ = evaluate_dense(inputs[3], xi)
     lost, lost_contact = _first_loss(*stop_gradient((table, seen, duration, steps)), values)
     between = (margin < 0) & ~jnp.isfinite(lost)  # a dip that no sample shows
     lost = jnp.where(between, stop_gradient(share), lost)
     lost_contact = jnp.where(between, contact, lost_contact)
-    return Score(margin, share, s, contact, lost, lost_contact)
+    return MarginResult(margin, share, s, contact, lost, lost_contact)
 
 
-def _values(table, seen, duration, steps: Arcs, count) -> Float[Array, "steps samples rows"]:
+def _sample(table, seen, duration, steps: DenseOutput, count) -> Float[Array, "steps samples rows"]:
     """`sampled_slacks` of the first `count` steps, few at a time: there is room for many more."""
     rows = steps.live.shape[0]
-    few = min(FEW, rows)
+    few = min(FEW_CANDIDATES, rows)
 
     def sample(k, values):
         first = jnp.minimum(k * few, rows - few)
@@ -206,11 +206,11 @@ def _values(table, seen, duration, steps: Arcs, count) -> Float[Array, "steps sa
         fresh = sampled_slacks(table, seen, duration, block)
         return jax.lax.dynamic_update_slice_in_dim(values, fresh, first, 0)
 
-    none = jnp.full((rows, SAMPLES, table.tangential.shape[0]), jnp.inf, steps.quintic.dtype)
+    none = jnp.full((rows, SAMPLES_PER_STEP, table.tangential.shape[0]), jnp.inf, steps.quintic.dtype)
     return jax.lax.fori_loop(0, (count + few - 1) // few, sample, none)
 
 
-def _lowest(values: Float[Array, "n"], count: int) -> Int[Array, "count"]:
+def _lowest_samples(values: Float[Array, "n"], count: int) -> Int[Array, "count"]:
     """The numbers of the lowest values, one after the other: sorting them all takes longer."""
 
     def take(values, _):
@@ -220,7 +220,7 @@ def _lowest(values: Float[Array, "n"], count: int) -> Int[Array, "count"]:
     return jax.lax.scan(take, stop_gradient(values), length=count)[1]
 
 
-def smooth_margin(values, weights, temperature: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def log_barrier_minimum(values, weights, temperature: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     r"""The smooth loss's counterpart of `min values`: `phi = max_m [ m + T sum_i w_i log((values_i - m) / T) ]`.
 
     `T` is the temperature [N] and `w` non-negative weights; `m`, returned second, solves
@@ -251,7 +251,7 @@ def smooth_margin(values, weights, temperature: Float[Array, ""]) -> tuple[Float
     return m + temperature * (weights * jnp.log(jnp.where(live, values - m, 1.0) / temperature)).sum(), m
 
 
-def _dips(values: Float[Array, "steps samples rows"]) -> Float[Array, "steps rows"]:
+def _candidate_minima(values: Float[Array, "steps samples rows"]) -> Float[Array, "steps rows"]:
     """About how low each slack goes in each step: the least of its samples and of the parabola about it."""
     least, seat = values.min(1), jnp.clip(jnp.argmin(values, axis=1), 1, values.shape[1] - 2)
     before, here, after = (jnp.take_along_axis(values, (seat + k)[:, None], axis=1)[:, 0] for k in (-1, 0, 1))
@@ -261,7 +261,7 @@ def _dips(values: Float[Array, "steps samples rows"]) -> Float[Array, "steps row
     return jnp.where(jnp.isfinite(least), jnp.minimum(least, lowest), jnp.inf)
 
 
-def _dip(inputs, how: Integration, contact, xi, low, high):
+def _refine_minimum(inputs, how: IntegratorOptions, contact, xi, low, high):
     """A constraint's least slack about `xi` of a step of the true motion, and where in `[low, high]` that is.
 
     To second order: the value and slope where a step of the solver ends at `xi`, the second derivative that of the
@@ -270,15 +270,15 @@ def _dip(inputs, how: Integration, contact, xi, low, high):
     table, seen, duration, arc, entry_w = inputs
     width = arc.share[1] - arc.share[0]
     share, begin = arc.share[0] + xi * width, jnp.stack([arc.quintic[0], entry_w])
-    s, w = single_step(table, seen, duration, how, arc.piece, arc.row, arc.share[0], begin, xi * width)
+    s, w = solver_step(table, seen, duration, how, arc.piece, arc.row, arc.share[0], begin, xi * width)
 
     def at(share, s, w):
-        return pick(slack(table, force(table, seen, duration, arc.piece, arc.row, share, s, w)), contact)
+        return take_row(force_slack(table, contact_force(table, seen, duration, arc.piece, arc.row, share, s, w)), contact)
 
-    bend = acceleration(table, seen, duration, arc.piece, arc.row, share, s, w)
+    bend = path_acceleration(table, seen, duration, arc.piece, arc.row, share, s, w)
     value, slope = jax.jvp(at, (share, s, w), (jnp.ones_like(share), w, bend))
     wide = jnp.where(width > 0, width, 1.0)
-    curve = _second(lambda xi: pick(slacks_on(table, seen, duration, arc, xi), contact), xi) / wide**2
+    curve = _second_derivative(lambda xi: take_row(slacks_at(table, seen, duration, arc, xi), contact), xi) / wide**2
     inner = (xi > 0) & (xi < 1) & (curve > 0)
     better = jnp.clip(xi - jnp.where(inner, slope / jnp.where(inner, curve, 1.0) / wide, 0.0), low, high)
     way = stop_gradient((better - xi) * width)
@@ -287,25 +287,25 @@ def _dip(inputs, how: Integration, contact, xi, low, high):
 
 
 @eqx.filter_custom_jvp
-def _carried(inputs, how, contact, xi, least):
-    """The `least` slack that was found at `xi`, with the derivatives of `_dip`."""
+def _with_envelope_derivative(inputs, how, contact, xi, least):
+    """The `plan_margin` slack that was found at `xi`, with the derivatives of `_refine_minimum`."""
     return least
 
 
-@_carried.def_jvp
+@_with_envelope_derivative.def_jvp
 def _(primals, tangents):
     (inputs, how, contact, xi, least), (change, *_) = primals, tangents
-    _, rate = eqx.filter_jvp(lambda inputs: _dip(inputs, how, contact, xi, 0.0, 1.0)[0], (inputs,), (change,))
+    _, rate = eqx.filter_jvp(lambda inputs: _refine_minimum(inputs, how, contact, xi, 0.0, 1.0)[0], (inputs,), (change,))
     return least, rate
 
 
-def _second(function, x):
+def _second_derivative(function, x):
     """The second derivative."""
     along = jnp.ones_like(x)
     return jax.jvp(lambda x: jax.jvp(function, (x,), (along,))[1], (x,), (along,))[1]
 
 
-def _minimise(function, low, high):
+def _golden_section(function, low, high):
     """About the least point of `function` in `[low, high]`, by golden section.
 
     A bracket's end counts where it is lower.
@@ -325,27 +325,27 @@ def _minimise(function, low, high):
         return low, high, jnp.where(better, points[lower], best), jnp.minimum(values[lower], least)
 
     start = (low, high, low, jnp.full_like(low, jnp.inf))
-    return stop_gradient(jax.lax.fori_loop(0, GOLDEN, narrow, start)[2])
+    return stop_gradient(jax.lax.fori_loop(0, GOLDEN_ITERATIONS, narrow, start)[2])
 
 
 def _first_loss(table, seen, duration, steps, values):
     """The share at which a contact's slack first turns negative, by bisection from the first sample that is."""
     negative = (values < 0).any(2)  # their least would go to a library of XLA's, with threads of its own
     first = jnp.argmax(negative.ravel())
-    step, sample = first // SAMPLES, first % SAMPLES
-    arc = jax.tree.map(lambda a: pick(a, step), steps)
-    width = 1.0 / (SAMPLES - 1)
+    step, sample = first // SAMPLES_PER_STEP, first % SAMPLES_PER_STEP
+    arc = jax.tree.map(lambda a: take_row(a, step), steps)
+    width = 1.0 / (SAMPLES_PER_STEP - 1)
     high = sample * width
 
     def halve(_, bracket):
         low, high, contact = bracket
         middle = (low + high) / 2
-        slacks = slacks_on(table, seen, duration, arc, middle)
+        slacks = slacks_at(table, seen, duration, arc, middle)
         gone = slacks.min() < 0
         contact = jnp.where(gone, jnp.argmin(slacks), contact)
         return jnp.where(gone, low, middle), jnp.where(gone, middle, high), contact
 
     bracket = (jnp.maximum(high - width, 0.0), high, jnp.argmin(values[step, sample]))
     _, xi, contact = jax.lax.fori_loop(0, jnp.where(jnp.any(negative), 50, 0), halve, bracket)
-    share = on_arc(arc, xi)[0]
+    share = evaluate_dense(arc, xi)[0]
     return jnp.where(jnp.any(negative), share, jnp.inf), contact

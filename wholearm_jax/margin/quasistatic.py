@@ -17,22 +17,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.dynamics.path_dynamics import Table, on_panel, powers
-from wholearm_jax.margin.contact_forces import MOST_ROLLING, linear_slacks
+from wholearm_jax.dynamics.path_dynamics import PathDynamics, evaluate, locate_panel
+from wholearm_jax.margin.contact_forces import MAX_ROLLING, cone_facets
 
-SPEEDS = 12  # speed intervals of the bound
-FASTEST = 8.0  # it covers speeds up to this many wire lengths a duration
-PLACES = 64
+BOUND_SPEEDS = 12  # speed intervals of the bound
+MAX_SPEED_RATIO = 8.0  # it covers speeds up to this many wire lengths a duration
+BOUND_PLACES = 64
 
 
-class Hold(eqx.Module):
+class QuasistaticTorque(eqx.Module):
     """The best torques for a motion at one place: `torque` [N m], least slack `margin` [N] (-inf: outside limits)."""
 
     torque: Float[Array, "2"]
     margin: Float[Array, ""]
 
 
-class Bound(eqx.Module):
+class MarginBound(eqx.Module):
     """No torque within limits keeps every slack above `value` [N] for a whole phase: `s` and `share` of the wire say
     where it is tight."""
 
@@ -41,26 +41,26 @@ class Bound(eqx.Module):
     share: Float[Array, ""]
 
 
-def coefficients(table: Table, s: Float[Array, ""]):
+def affine_coefficients(table: PathDynamics, s: Float[Array, ""]):
     """Coefficients of `a` (5) and of the forces (slots x 5) at `s`, in the piece that holds it."""
     panel, xi = _place(table, s)
-    return on_panel(table.acceleration, panel, xi), on_panel(table.force, panel, xi)
+    return evaluate(table.acceleration, panel, xi), evaluate(table.force, panel, xi)
 
 
-def acceleration_terms(table: Table, s: Float[Array, ""]) -> Float[Array, "5"]:
+def acceleration_terms(table: PathDynamics, s: Float[Array, ""]) -> Float[Array, "5"]:
     """Those of `a` alone."""
-    return on_panel(table.acceleration, *_place(table, s))
+    return evaluate(table.acceleration, *_place(table, s))
 
 
-def _place(table: Table, s):
+def _place(table: PathDynamics, s):
     inner = table.breaks[1:-1]
-    return powers(table, jnp.minimum((s >= inner).sum(), table.count - 1), s)
+    return locate_panel(table, jnp.minimum((s >= inner).sum(), table.count - 1), s)
 
 
-def hold(table: Table, s, v=0.0, a=0.0) -> Hold:
+def best_quasistatic_torque(table: PathDynamics, s, v=0.0, a=0.0) -> QuasistaticTorque:
     """Torques that give the motion `(v, a)` at `s` [1/s, 1/s^2] with the largest least slack, in closed form."""
-    motion, force = coefficients(table, s)
-    force = linear_slacks(table, force)
+    motion, force = affine_coefficients(table, s)
+    force = cone_facets(table, force)
     one = jnp.ones_like(s)
     speed = jnp.stack([one, v**2 * one, v * one])
     pull = motion[3:]
@@ -83,43 +83,43 @@ def hold(table: Table, s, v=0.0, a=0.0) -> Hold:
     within = steep | (jnp.abs(base) <= table.torque_limit)  # a torque that is the same along all of the squeeze
     possible = (low <= high) & jnp.all(within) & jnp.all(jnp.isfinite(least))
     margin = jnp.where(possible, least[best], -jnp.inf)
-    return Hold(base + tries[best] * free, margin)
+    return QuasistaticTorque(base + tries[best] * free, margin)
 
 
-def holds(table: Table, s, v, a) -> Hold:
-    """`hold` at many places."""
-    return jax.vmap(hold, (None, 0, 0, 0))(table, s, v, a)
+def best_quasistatic_torque_batch(table: PathDynamics, s, v, a) -> QuasistaticTorque:
+    """`best_quasistatic_torque` at many places."""
+    return jax.vmap(best_quasistatic_torque, (None, 0, 0, 0))(table, s, v, a)
 
 
-def bound(table: Table, duration: Float[Array, ""], from_rest=True, to_rest=True, rolling: int = MOST_ROLLING) -> Bound:
+def margin_upper_bound(table: PathDynamics, duration: Float[Array, ""], from_rest=True, to_rest=True, rolling: int = MAX_ROLLING) -> MarginBound:
     """An upper bound on the margin of a phase along a wire that starts, and ends, at rest or moving.
 
-    At each of many places the least slack is maximised over torques within limits and over speeds up to `FASTEST` wire
+    At each of many places the least slack is maximised over torques within limits and over speeds up to `MAX_SPEED_RATIO` wire
     lengths a duration (each interval of speeds by its most favourable corner, so that the bound errs upward); at rest
     speed is 0 and the acceleration may point only forward (start) or backward (end). The smallest of these bounds the
     phase. What no more than `rolling` contacts can need is left out: without any, it takes less than half the time.
     """
-    fastest = FASTEST * table.length / duration
-    speeds = fastest * jnp.linspace(0.0, 1.0, SPEEDS + 1) ** 2
-    places = table.breaks[0] + table.length * jnp.linspace(0.0, 1.0, PLACES + 1)
-    motion, force = jax.vmap(partial(coefficients, table))(places)
-    force = jax.vmap(partial(linear_slacks, table, rolling=rolling))(force)[:, None]
+    fastest = MAX_SPEED_RATIO * table.length / duration
+    speeds = fastest * jnp.linspace(0.0, 1.0, BOUND_SPEEDS + 1) ** 2
+    places = table.breaks[0] + table.length * jnp.linspace(0.0, 1.0, BOUND_PLACES + 1)
+    motion, force = jax.vmap(partial(affine_coefficients, table))(places)
+    force = jax.vmap(partial(cone_facets, table, rolling=rolling))(force)[:, None]
     still, square, linear, slope = force[..., 0], force[..., 1], force[..., 2], force[..., 3:]
 
     low, high = speeds[:-1, None], speeds[1:, None]
     moving = still + jnp.maximum(square * low**2, square * high**2) + jnp.maximum(linear * low, linear * high)
-    ends, sign = jnp.array([0, PLACES]), jnp.array([1.0, -1.0])
-    count = moving.shape[0] * SPEEDS
+    ends, sign = jnp.array([0, BOUND_PLACES]), jnp.array([1.0, -1.0])
+    count = moving.shape[0] * BOUND_SPEEDS
     best = jax.vmap(partial(_best, table))(
         jnp.concatenate([moving.reshape(count, -1), still[ends, 0]]),
-        jnp.concatenate([jnp.repeat(slope[:, 0], SPEEDS, axis=0), slope[ends, 0]]),
+        jnp.concatenate([jnp.repeat(slope[:, 0], BOUND_SPEEDS, axis=0), slope[ends, 0]]),
         jnp.concatenate([jnp.zeros((count, 2)), sign[:, None] * motion[ends, 3:]]),
         jnp.concatenate([jnp.ones(count), sign * motion[ends, 0]]),
     )
-    values = best[:count].reshape(-1, SPEEDS).max(1)
+    values = best[:count].reshape(-1, BOUND_SPEEDS).max(1)
     values = values.at[ends].set(jnp.where(jnp.stack([from_rest, to_rest]), best[count:], values[ends]))
     k = jnp.argmin(values)
-    return Bound(values[k], places[k], k / PLACES)
+    return MarginBound(values[k], places[k], k / BOUND_PLACES)
 
 
 def _rows(slacks: int) -> Int[np.ndarray, "vertices 3"]:

@@ -20,19 +20,19 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.model.contact_kinematics import normal_rows, slip_rows
-from wholearm_jax.model.mechanics import system
-from wholearm_jax.model.scene import Formation, Scene, body
-from wholearm_jax.model.schedule import Torque, rounding
+from wholearm_jax.model.contact_kinematics import normal_jacobian, tangential_jacobian
+from wholearm_jax.model.mechanics import scaled_mechanics
+from wholearm_jax.model.scene import ContactFormation, Scene, rigid_body
+from wholearm_jax.model.schedule import TorqueSchedule, time_tolerance
 
-POSSIBLE = -1e-8  # least margin that counts as possible, over the unit of force: rounding
-EXACT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
-JAMMED = 1e6  # the largest margin, over the unit of force: friction may let forces grow without end
-NEVER = np.zeros((0, 3))
-CLOSE = 0.99  # share of the best margin for which a hold's torque moves away from where the object would start to move
+FEASIBILITY_TOL = -1e-8  # least margin that counts as possible, over the unit of force: rounding
+SOLVER_TOL = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+MARGIN_CAP = 1e6  # the largest margin, over the unit of force: friction may let forces grow without end
+NO_ROWS = np.zeros((0, 3))
+MARGIN_TIE = 0.99  # share of the best margin for which a hold's torque moves away from where the object would start to move
 
 
-class Held(NamedTuple):
+class RestInterval(NamedTuple):
     """An object at rest for a while: `start` and `end` [s], its least margin [N], when, and at which contact.
 
     `lost` is the time from which no forces can hold it there, None where some always can.
@@ -54,7 +54,7 @@ class Held(NamedTuple):
         return f"{span}, hold's margin {self.margin:.4g} N at {self.contact}"
 
 
-class Support(NamedTuple):
+class StaticMargin(NamedTuple):
     """The best that contacts can do at rest: `margin` [N], the `contact` that limits it, a `torque` [N m] for it."""
 
     margin: float
@@ -62,7 +62,7 @@ class Support(NamedTuple):
     torque: Float[np.ndarray, "2"]
 
 
-class Departure(NamedTuple):
+class RestAccelerations(NamedTuple):
     """Accelerations `d2s/dt2` at rest, linear in `(1, tau1, tau2)`, with the friction of travel forward and backward.
 
     An object stays while the first is not positive and the second not negative.
@@ -87,22 +87,22 @@ class Statics:
     torque_limit: Float[np.ndarray, "2"]
     unit: float
 
-    def support(self, torque) -> Support:
+    def support(self, torque) -> StaticMargin:
         """The hold's margin under a given torque [N m]."""
         return self._best(np.column_stack([torque, torque]))
 
-    def best(self, departure: Departure | None = None) -> Support:
+    def best(self, departure: RestAccelerations | None = None) -> StaticMargin:
         """The largest margin of all torques within limits; with a `departure`, of those that do not move the object."""
         limits = np.column_stack([-self.torque_limit, self.torque_limit])
         return self._best(limits, _still(departure))
 
-    def steadiest(self, departure: Departure) -> Support:
-        """A torque with `CLOSE` of the largest margin, as far as it can be from those that move the object."""
+    def steadiest(self, departure: RestAccelerations) -> StaticMargin:
+        """A torque with `MARGIN_TIE` of the largest margin, as far as it can be from those that move the object."""
         limits, still = np.column_stack([-self.torque_limit, self.torque_limit]), _still(departure)
         top = self._best(limits, still)
         if not top.margin > 0:
             return top
-        central = self._maximise(limits, (0.0, None), floor=CLOSE * top.margin / self.unit, still=still, apart=1.0)
+        central = self._maximise(limits, (0.0, None), floor=MARGIN_TIE * top.margin / self.unit, still=still, apart=1.0)
         return self.support(self._torque(central)) if central.status == 0 else top
 
     def lost(self, before, after) -> float:
@@ -116,19 +116,19 @@ class Statics:
     def _torque(found) -> Float[np.ndarray, "2"]:
         return found.x[-3:-1]
 
-    def _best(self, limits, still=NEVER) -> Support:
+    def _best(self, limits, still=NO_ROWS) -> StaticMargin:
         """Maximise the margin; where no forces are possible, minus the least adhesion."""
-        found = self._maximise(limits, (0.0, JAMMED), press=1.0, still=still)
+        found = self._maximise(limits, (0.0, MARGIN_CAP), press=1.0, still=still)
         if found.status != 0:
             found = self._maximise(limits, (None, 0.0), press=1.0, adhesion=1.0, still=still)
         if found.status != 0:
-            return Support(-np.inf, self.names[0], limits.mean(1))
+            return StaticMargin(-np.inf, self.names[0], limits.mean(1))
         # Each contact's share of the price of the margin: its pressure's, and where it adheres that of its cone.
         pressure, one, other = -found.ineqlin.marginals[: 3 * len(self.names)].reshape(3, -1)
         price = pressure + self.friction * (one + other) * (found.x[-1] < 0)
-        return Support(float(found.x[-1]) * self.unit, self.names[int(np.argmax(price))], self._torque(found))
+        return StaticMargin(float(found.x[-1]) * self.unit, self.names[int(np.argmax(price))], self._torque(found))
 
-    def _maximise(self, limits, bounds, *, press=0.0, floor=0.0, adhesion=0.0, still=NEVER, apart=0.0, path=None):
+    def _maximise(self, limits, bounds, *, press=0.0, floor=0.0, adhesion=0.0, still=NO_ROWS, apart=0.0, path=None):
         """The linear programme in `(c_n, c_t, d, tau1, tau2, m)` that maximises `m` within `bounds`, with
 
             c_n >= press m + floor,     |c_t| <= mu (c_n - adhesion m),     still @ (1, tau) <= -apart m
@@ -156,11 +156,11 @@ class Statics:
             A_eq=equal,
             b_eq=right,
             bounds=[*free, *zip(-self.dry, self.dry, strict=True), *limits.tolist(), bounds],
-            options=EXACT,
+            options=SOLVER_TOL,
         )
 
 
-def statics(scene: Scene, formation: Formation, z: Float[Array, "5"]) -> Statics:
+def contact_statics(scene: Scene, formation: ContactFormation, z: Float[Array, "5"]) -> Statics:
     """The balance of forces for an object at rest at `z` (SI) in a formation, of however many contacts."""
     mechanics, normal, slip = jax.device_get(_rows(scene, formation, z))
     slots, joints = list(formation.normal_slots), np.eye(5)[:, 3:]
@@ -179,32 +179,32 @@ def statics(scene: Scene, formation: Formation, z: Float[Array, "5"]) -> Statics
 
 
 @jax.jit
-def _rows(scene: Scene, formation: Formation, z):
-    mechanics = system(body(scene.object), scene.hand, scene.gravity, formation)
+def _rows(scene: Scene, formation: ContactFormation, z):
+    mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, formation)
     here = z / mechanics.configuration_unit
-    return mechanics, normal_rows(mechanics.contacts, here), slip_rows(mechanics.contacts, here)
+    return mechanics, normal_jacobian(mechanics.contacts, here), tangential_jacobian(mechanics.contacts, here)
 
 
-def watch(balance: Statics, schedule: Torque, start: float, end: float) -> Held:
+def rest_margin(balance: Statics, schedule: TorqueSchedule, start: float, end: float) -> RestInterval:
     """The margin of a hold from `start` to `end` [s] under a schedule, exactly: linear torque, concave margin."""
     times, torques = _corners(schedule, start, end)
     supports = [balance.support(torque) for torque in torques]
     worst = int(np.argmin([one.margin for one in supports]))
-    floor = POSSIBLE * balance.unit
+    floor = FEASIBILITY_TOL * balance.unit
     bad = next((k for k, one in enumerate(supports) if one.margin < floor), None)
     lost, which = None, supports[worst].contact
     if bad is not None:
         which = supports[bad].contact
         share = balance.lost(torques[bad - 1], torques[bad]) if bad > 0 else 1.0
         lost = times[max(bad - 1, 0)] + share * (times[bad] - times[max(bad - 1, 0)])
-    return Held(start, end, supports[worst].margin, times[worst], which, lost)
+    return RestInterval(start, end, supports[worst].margin, times[worst], which, lost)
 
 
-def _corners(schedule: Torque, start: float, end: float):
+def _corners(schedule: TorqueSchedule, start: float, end: float):
     """Times and torques between which a schedule is linear from `start` to `end`; a step has both its sides, but for
     one at `start` or `end`, where only what is between counts."""
     times, values = np.asarray(schedule.times), np.asarray(schedule.values)
-    near = rounding(times, start, end)
+    near = time_tolerance(times, start, end)
     inside = (times > start + near) & (times < end - near)
 
     def at(time, row):
@@ -217,9 +217,9 @@ def _corners(schedule: Torque, start: float, end: float):
     return [start, *times[inside].tolist(), end], [at(start, first), *values[inside], at(end, last)]
 
 
-def _still(departure: Departure | None) -> Float[np.ndarray, "rows 3"]:
+def _still(departure: RestAccelerations | None) -> Float[np.ndarray, "rows 3"]:
     """Rows with `row @ (1, tau) <= 0` while the object stays, of unit size in the torque."""
     if departure is None:
-        return NEVER
+        return NO_ROWS
     rows = np.stack([departure.ahead, -departure.behind])
     return rows / np.linalg.norm(rows[:, 1:], axis=1, keepdims=True)

@@ -23,26 +23,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from wholearm_jax.model.scene import EDGE, VERTEX, Body, Formation, Hand, next_vertex
+from wholearm_jax.model.scene import EDGE, VERTEX, RigidBody, ContactFormation, Hand, next_vertex
 
-ROOT, PALM_END = 2, 3  # corners that no formation holds, at an edge of the object: where a finger or the palm begins
-CORNER = 1e-6  # length units of an edge beside its ends at which it is a vertex of the object that meets such a corner
-GROUPS = (
+FINGER_ROOT, PALM_END = 2, 3  # corners that no formation holds, at an edge of the object: where a finger or the palm begins
+CORNER_TOL = 1e-6  # length units of an edge beside its ends at which it is a vertex of the object that meets such a corner
+FEATURE_GROUPS = (
     *((0, VERTEX), (1, VERTEX), (2, VERTEX), (1, EDGE), (2, EDGE)),
-    *((1, ROOT), (2, ROOT), (1, PALM_END), (2, PALM_END)),
+    *((1, FINGER_ROOT), (2, FINGER_ROOT), (1, PALM_END), (2, PALM_END)),
 )
 """Link (of the palm's ends: the finger beside it) and kind of all that may meet, each with every feature in turn."""
-HELD = 5  # of these groups are contacts that a formation may hold
+CONTACT_GROUPS = 5  # of these groups are contacts that a formation may hold
 
 Vector = tuple[Float[Array, "*contacts"], Float[Array, "*contacts"]]
 """A vector for each contact, by components: put together they would be taken apart again by what is computed next, in
 kernels that do nothing else."""
 
 
-class Contacts(eqx.Module):
-    """Contacts as arrays; the leading axis runs over the constraints of a formation (`Formation`).
+class ContactSet(eqx.Module):
+    """Contacts as arrays; the leading axis runs over the constraints of a formation (`ContactFormation`).
 
-    `along` (see `Frame`) must stay within `[lower, upper]`: the link's extent for type A, the edge's for type B.
+    `along` (see `ContactKinematics`) must stay within `[lower, upper]`: the link's extent for type A, the edge's for type B.
     `tangential` marks rows that constrain the slip, at the place `held`, and `slides` those of contacts that may slip.
     """
 
@@ -62,7 +62,7 @@ class Contacts(eqx.Module):
     held: Float[Array, "slots"]
 
 
-class Frame(eqx.Module):
+class ContactKinematics(eqx.Module):
     """A contact at one configuration: gap `C`, place `along` its feature, normal, point against `q` and against `j`."""
 
     gap: Float[Array, "*contacts"]
@@ -72,13 +72,13 @@ class Frame(eqx.Module):
     from_joint: Vector
 
 
-def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
+def contact_set(body: RigidBody, hand: Hand, formation: ContactFormation) -> ContactSet:
     """Gather the geometry of a formation (or of any list of link, kind, feature)."""
     of_finger = jax.nn.one_hot(formation.link - 1, 2, dtype=body.mass.dtype)
     of_palm = (formation.kind == PALM_END)[:, None]
     finger = jnp.where(of_palm, 0.0, of_finger)  # the palm's end turns with no finger
-    palm, corner = formation.link == 0, formation.kind >= ROOT
-    beside = jnp.where(corner, CORNER, 0.0)
+    palm, corner = formation.link == 0, formation.kind >= FINGER_ROOT
+    beside = jnp.where(corner, CORNER_TOL, 0.0)
     on_link = formation.kind == VERTEX
     start = body.vertices[formation.feature]
     end = body.vertices[next_vertex(body.count, body.vertices.shape[0])[formation.feature]]
@@ -92,7 +92,7 @@ def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
     def components(vectors) -> Vector:
         return vectors[:, 0], vectors[:, 1]
 
-    return Contacts(
+    return ContactSet(
         on_link=on_link,
         finger=components(finger),
         side=jnp.where(formation.link == 2, -1.0, 1.0).astype(body.mass.dtype),
@@ -110,29 +110,29 @@ def contacts(body: Body, hand: Hand, formation: Formation) -> Contacts:
     )
 
 
-def placed(several: Contacts, z: Float[Array, "5"]) -> Contacts:
+def anchor_rolling(several: ContactSet, z: Float[Array, "5"]) -> ContactSet:
     """Contacts that roll stay from now on at the places `along` their features which they have at `z`."""
-    return eqx.tree_at(lambda c: c.held, several, frames(several, z).along)
+    return eqx.tree_at(lambda c: c.held, several, contact_kinematics(several, z).along)
 
 
-def every_contact(capacity: int) -> Formation:
+def contact_candidates(capacity: int) -> ContactFormation:
     """All pairs that may touch: each vertex on each link, each fingertip on each edge (`5 * capacity` rows)."""
-    return _on_features(GROUPS[:HELD], capacity)
+    return _on_features(FEATURE_GROUPS[:CONTACT_GROUPS], capacity)
 
 
-def every_meeting(capacity: int) -> Formation:
-    """The same, then each finger's root and each end of the palm on each edge, which stop the object: all `GROUPS`."""
-    return _on_features(GROUPS, capacity)
+def obstacle_candidates(capacity: int) -> ContactFormation:
+    """The same, then each finger's root and each end of the palm on each edge, which stop the object: all `FEATURE_GROUPS`."""
+    return _on_features(FEATURE_GROUPS, capacity)
 
 
-def _on_features(groups, capacity: int) -> Formation:
+def _on_features(groups, capacity: int) -> ContactFormation:
     link, kind = (jnp.repeat(jnp.asarray(column), capacity) for column in zip(*groups, strict=True))
     rows = len(groups) * capacity
-    return Formation(link, kind, jnp.tile(jnp.arange(capacity), len(groups)), jnp.zeros(rows, bool))
+    return ContactFormation(link, kind, jnp.tile(jnp.arange(capacity), len(groups)), jnp.zeros(rows, bool))
 
 
 @jax.jit
-def frames(several: Contacts, z: Float[Array, "5"]) -> Frame:
+def contact_kinematics(several: ContactSet, z: Float[Array, "5"]) -> ContactKinematics:
     """Contacts (or one, without a leading axis) at configuration `z`.
 
     Written by components: that compiles to a seventh of the kernels that small matrix products take.
@@ -151,7 +151,7 @@ def frames(several: Contacts, z: Float[Array, "5"]) -> Frame:
     nx, ny = -ey, ex  # the edge's normal, into the object
     on = several.on_link
     wx, wy = fx + jnp.where(on, 0.0, tx), fy + jnp.where(on, 0.0, ty)
-    return Frame(
+    return ContactKinematics(
         gap=jnp.where(on, lx * rx + ly * ry - several.offset, -(nx * tx + ny * ty)),
         along=jnp.where(on, dx * rx + dy * ry, ex * tx + ey * ty),
         normal=(jnp.where(on, lx, nx), jnp.where(on, ly, ny)),
@@ -175,75 +175,75 @@ def _(primals, tangents):
     return (cosines, sines), (-sines * tangents[0], cosines * tangents[0])
 
 
-def gaps(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "contacts"]:
+def gaps(several: ContactSet, z: Float[Array, "5"]) -> Float[Array, "contacts"]:
     """The C-functions `C_n(z)` [m]: 0 in contact, positive apart."""
-    return frames(several, z).gap
+    return contact_kinematics(several, z).gap
 
 
-def normal_rows(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "contacts 5"]:
+def normal_jacobian(several: ContactSet, z: Float[Array, "5"]) -> Float[Array, "contacts 5"]:
     """`G_n = dC_n/dz`, the paper's `[W_n^T, -J_n]`."""
-    at = frames(several, z)
-    return _velocity_rows(several, at, at.normal)
+    at = contact_kinematics(several, z)
+    return _jacobian_along(several, at, at.normal)
 
 
-def slip_rows(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "contacts 5"]:
+def tangential_jacobian(several: ContactSet, z: Float[Array, "5"]) -> Float[Array, "contacts 5"]:
     """`G_t`, the paper's `[W_t^T, -J_t]`: slip velocity is `G_t z_dot`, the object against the link."""
-    at = frames(several, z)
-    return _velocity_rows(several, at, _turned(at.normal))
+    at = contact_kinematics(several, z)
+    return _jacobian_along(several, at, _rotate_minus_90(at.normal))
 
 
-def gap_rates(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "contacts"]:
+def gap_velocity(several: ContactSet, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "contacts"]:
     """How fast gaps open where `z` moves at the rate `x`: `G_n x`, without the rows."""
-    at = frames(several, z)
-    return _velocities(several, at, at.normal, x)
+    at = contact_kinematics(several, z)
+    return _velocity_along(several, at, at.normal, x)
 
 
-def along_rates(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "contacts"]:
+def feature_velocity(several: ContactSet, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "contacts"]:
     """How fast places move `along` their features where `z` moves at the rate `x`."""
-    at = frames(several, z)
-    return _sense(several) * _velocities(several, at, _turned(at.normal), x)
+    at = contact_kinematics(several, z)
+    return _feature_sign(several) * _velocity_along(several, at, _rotate_minus_90(at.normal), x)
 
 
 @jax.jit
-def slips(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "slots"]:
+def slip_velocity(several: ContactSet, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "slots"]:
     """`G_t x` of the contacts that may slip; 0 for those that roll."""
-    return slips_at(several, frames(several, z), x)
+    return slip_velocity_at(several, contact_kinematics(several, z), x)
 
 
-def slips_at(several: Contacts, at: Frame, x: Float[Array, "5"]) -> Float[Array, "slots"]:
+def slip_velocity_at(several: ContactSet, at: ContactKinematics, x: Float[Array, "5"]) -> Float[Array, "slots"]:
     """The same, where the contacts are known already."""
-    return jnp.where(several.slides, _velocities(several, at, _turned(at.normal), x), 0.0)
+    return jnp.where(several.slides, _velocity_along(several, at, _rotate_minus_90(at.normal), x), 0.0)
 
 
 @jax.jit
-def constraints(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "slots"]:
+def constraints(several: ContactSet, z: Float[Array, "5"]) -> Float[Array, "slots"]:
     """What a formation keeps at zero: gaps `C_n(z)`, and `C_t(z)` in the tangential rows of rolling contacts."""
-    at = frames(several, z)
-    return jnp.where(several.tangential, _sense(several) * (at.along - several.held), at.gap)
+    at = contact_kinematics(several, z)
+    return jnp.where(several.tangential, _feature_sign(several) * (at.along - several.held), at.gap)
 
 
 @jax.jit
-def constraint_rows(several: Contacts, z: Float[Array, "5"]) -> Float[Array, "slots 5"]:
+def constraint_jacobian(several: ContactSet, z: Float[Array, "5"]) -> Float[Array, "slots 5"]:
     """The gradient `G` of `constraints`: `G_n`, and `G_t` in the tangential rows."""
-    at = frames(several, z)
-    return _velocity_rows(several, at, _constrained(several, at))
+    at = contact_kinematics(several, z)
+    return _jacobian_along(several, at, _constraint_direction(several, at))
 
 
-def constraint_rates(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "slots"]:
+def constraint_velocity(several: ContactSet, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "slots"]:
     """`G x`, without the rows: a few sums a contact, where only they are wanted."""
-    at = frames(several, z)
-    return _velocities(several, at, _constrained(several, at), x)
+    at = contact_kinematics(several, z)
+    return _velocity_along(several, at, _constraint_direction(several, at), x)
 
 
-def constraint_curvature(several: Contacts, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "slots"]:
+def constraint_second_derivative(several: ContactSet, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "slots"]:
     """`x^T (d2C/dz2) x` for each constraint: what `G x' = -x^T H x` needs.
 
     A constraint is `u . r`: a direction `u` on the link (type A) or the object (B), turning at the rate `w`, and the
     way `r` from a point of the same body to one of the other. Along `z + x t` its second derivative is
     `-w^2 u.r + 2 w S u.r' + u.r''`, and `r''` points back to the centres that both points turn about.
     """
-    at, on, (dx, dy), turn = frames(several, z), several.on_link, (x[0], x[1]), x[2]
-    swing = _swing(several, x)
+    at, on, (dx, dy), turn = contact_kinematics(several, z), several.on_link, (x[0], x[1]), x[2]
+    swing = _link_rate(several, x)
     (nx, ny), (ox, oy), (jx, jy) = at.normal, at.from_object, at.from_joint
     rx, ry = ny * at.along - nx * at.gap, -nx * at.along - ny * at.gap  # B: from the edge's start to the tip
     rx, ry = jnp.where(on, jx, rx), jnp.where(on, jy, ry)
@@ -259,42 +259,42 @@ def constraint_curvature(several: Contacts, z: Float[Array, "5"], x: Float[Array
     return sign * (ux * ax + uy * ay - w**2 * (ux * rx + uy * ry) + 2 * w * (ux * vy - uy * vx))
 
 
-def _sense(several: Contacts) -> Float[Array, "slots"]:
+def _feature_sign(several: ContactSet) -> Float[Array, "slots"]:
     """The sign by which slip, that of the object against the link, moves a contact `along` its feature."""
     return jnp.where(several.on_link, several.side, -1.0)
 
 
-def _constrained(several: Contacts, at: Frame) -> Vector:
+def _constraint_direction(several: ContactSet, at: ContactKinematics) -> Vector:
     """The direction in which each constraint keeps the object from moving: the normal, or the tangent."""
-    (nx, ny), (tx, ty) = at.normal, _turned(at.normal)
+    (nx, ny), (tx, ty) = at.normal, _rotate_minus_90(at.normal)
     return jnp.where(several.tangential, tx, nx), jnp.where(several.tangential, ty, ny)
 
 
-def _velocity_rows(several: Contacts, at: Frame, direction: Vector) -> Float[Array, "slots 5"]:
+def _jacobian_along(several: ContactSet, at: ContactKinematics, direction: Vector) -> Float[Array, "slots 5"]:
     """Rows whose product with `z_dot` is the velocity along a direction at the contact, the object against the link."""
-    ux, uy, turn, arm = _moments(at, direction)
+    ux, uy, turn, arm = _moment_arms(at, direction)
     first, second = several.finger
     return jnp.stack([ux, uy, turn, arm * first, arm * second], axis=1)
 
 
-def _velocities(several: Contacts, at: Frame, direction: Vector, x) -> Float[Array, "slots"]:
+def _velocity_along(several: ContactSet, at: ContactKinematics, direction: Vector, x) -> Float[Array, "slots"]:
     """Those rows times `x`."""
-    ux, uy, turn, arm = _moments(at, direction)
-    return ux * x[0] + uy * x[1] + turn * x[2] + arm * _swing(several, x)
+    ux, uy, turn, arm = _moment_arms(at, direction)
+    return ux * x[0] + uy * x[1] + turn * x[2] + arm * _link_rate(several, x)
 
 
-def _swing(several: Contacts, x: Float[Array, "5"]) -> Float[Array, "slots"]:
+def _link_rate(several: ContactSet, x: Float[Array, "5"]) -> Float[Array, "slots"]:
     """How fast each contact's own link turns; the palm does not."""
     first, second = several.finger
     return first * x[3] + second * x[4]
 
 
-def _moments(at: Frame, direction: Vector):
+def _moment_arms(at: ContactKinematics, direction: Vector):
     """A direction's components, and its moments about the object's origin and, the other way, the link's joint."""
     (ux, uy), (ox, oy), (jx, jy) = direction, at.from_object, at.from_joint
     return ux, uy, uy * ox - ux * oy, ux * jy - uy * jx
 
 
-def _turned(normal: Vector) -> Vector:
+def _rotate_minus_90(normal: Vector) -> Vector:
     x, y = normal
     return y, -x

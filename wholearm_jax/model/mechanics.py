@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from wholearm_jax.model.contact_kinematics import Contacts, contacts, every_meeting
-from wholearm_jax.model.scene import EDGE, VERTEX, Body, Formation, Hand, next_vertex
+from wholearm_jax.model.contact_kinematics import ContactSet, contact_set, obstacle_candidates
+from wholearm_jax.model.scene import EDGE, VERTEX, RigidBody, ContactFormation, Hand, next_vertex
 
 
-class System(eqx.Module):
+class ScaledMechanics(eqx.Module):
     """A formation on a hand, dimensionless but for time.
 
     `inertia` is the diagonal of `M = diag(m, m, I, J1, J2)`; `viscous` and `dry` are B and D; `gravity` is an
@@ -24,8 +24,8 @@ class System(eqx.Module):
     `length` [m] and `mass` [kg] are the units; `torque_limit` stays in N m.
     """
 
-    contacts: Contacts
-    candidates: Contacts
+    contacts: ContactSet
+    candidates: ContactSet
     real: Bool[Array, "candidates"]
     watched: Bool[Array, "candidates"]
     behind: Bool[Array, "candidates"]
@@ -59,12 +59,12 @@ def configuration_unit(length: Float[Array, ""]) -> Float[Array, "5"]:
     return jnp.stack([length, length, one, one, one])
 
 
-def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Formation) -> System:
+def scaled_mechanics(body: RigidBody, hand: Hand, gravity: Float[Array, "2"], formation: ContactFormation) -> ScaledMechanics:
     """Scale a formation by the object's size and mass."""
     real = jnp.arange(body.vertices.shape[0]) < body.count
     length, mass = jnp.sqrt(jnp.where(real, (body.vertices**2).sum(1), 0.0).max()), body.mass
     rotary = mass * length**2
-    small_body = Body(body.vertices / length, body.count, body.mass / mass, body.inertia / rotary, body.friction)
+    small_body = RigidBody(body.vertices / length, body.count, body.mass / mass, body.inertia / rotary, body.friction)
     small_hand = Hand(
         joint=hand.joint / length,
         length=hand.length / length,
@@ -74,15 +74,15 @@ def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Format
         dry=hand.dry / rotary,
         torque_limit=hand.torque_limit,
     )
-    pairs = every_meeting(body.vertices.shape[0])
+    pairs = obstacle_candidates(body.vertices.shape[0])
     touchable = pairs.feature < body.count
     heavy = jnp.stack([small_body.mass, small_body.mass, small_body.inertia])
-    return System(
-        contacts=contacts(small_body, small_hand, formation),
-        candidates=contacts(small_body, small_hand, pairs),
+    return ScaledMechanics(
+        contacts=contact_set(small_body, small_hand, formation),
+        candidates=contact_set(small_body, small_hand, pairs),
         real=touchable,
-        watched=touchable & ~_coincident(pairs, formation, body.count),
-        behind=_behind(pairs, formation, _convex(body)),
+        watched=touchable & ~_coincides_with_contact(pairs, formation, body.count),
+        behind=_may_be_behind(pairs, formation, _is_convex(body)),
         inertia=jnp.concatenate([heavy, small_hand.inertia]),
         viscous=small_hand.viscous,
         dry=small_hand.dry,
@@ -93,7 +93,7 @@ def system(body: Body, hand: Hand, gravity: Float[Array, "2"], formation: Format
     )
 
 
-def _convex(body: Body) -> Bool[Array, ""]:
+def _is_convex(body: RigidBody) -> Bool[Array, ""]:
     """Whether no corner of the object turns clockwise."""
     following = next_vertex(body.count, body.vertices.shape[0])
     edge = body.vertices[following] - body.vertices
@@ -101,7 +101,7 @@ def _convex(body: Body) -> Bool[Array, ""]:
     return jnp.all((turn >= 0) | (jnp.arange(turn.shape[0]) >= body.count))
 
 
-def _behind(pairs: Formation, formation: Formation, convex) -> Bool[Array, "candidates"]:
+def _may_be_behind(pairs: ContactFormation, formation: ContactFormation, convex) -> Bool[Array, "candidates"]:
     """Vertices against links that they may lie behind: any finger but one that vertices of a convex object slide on."""
 
     def holds(link):
@@ -110,7 +110,7 @@ def _behind(pairs: Formation, formation: Formation, convex) -> Bool[Array, "cand
     return (pairs.kind == VERTEX) & (pairs.link > 0) & ~(convex & jax.vmap(holds)(pairs.link))
 
 
-def _coincident(pairs: Formation, formation: Formation, count) -> Bool[Array, "candidates"]:
+def _coincides_with_contact(pairs: ContactFormation, formation: ContactFormation, count) -> Bool[Array, "candidates"]:
     """Pairs that are in the formation or coincide with one of its contacts."""
 
     def same(link, kind, feature):

@@ -9,16 +9,16 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-APART = 1e-9  # least distance between neighbouring vertices, and least breadth of a polygon, over its size
+MIN_SEPARATION = 1e-9  # least distance between neighbouring vertices, and least breadth of a polygon, over its size
 
 
-def first_flaw(outlines: Num[np.ndarray, "polygons vertices 2"]) -> tuple[int, str] | None:
+def find_defect(outlines: Num[np.ndarray, "polygons vertices 2"]) -> tuple[int, str] | None:
     """The first outline that is no polygon, and why; None where all are."""
     following = np.roll(outlines, -1, axis=1)
     size = np.ptp(outlines, axis=1).max(-1)
-    repeated = np.hypot(*np.moveaxis(following - outlines, -1, 0)) <= APART * size[:, None]
+    repeated = np.hypot(*np.moveaxis(following - outlines, -1, 0)) <= MIN_SEPARATION * size[:, None]
     centred = outlines - outlines.mean(1, keepdims=True)
-    thin = np.linalg.svd(centred, compute_uv=False)[:, 1] <= APART * size
+    thin = np.linalg.svd(centred, compute_uv=False)[:, 1] <= MIN_SEPARATION * size
     crossing = _crossing(centred)
     after = np.roll(centred, -1, axis=1)
     clockwise = (centred[..., 0] * after[..., 1] - centred[..., 1] * after[..., 0]).sum(1) < 0
@@ -36,7 +36,7 @@ def first_flaw(outlines: Num[np.ndarray, "polygons vertices 2"]) -> tuple[int, s
     return row, "clockwise: give the vertices anticlockwise"
 
 
-def stays_simple(outline: Float[np.ndarray, "vertices 2"], moves: Float[np.ndarray, "vertices"]) -> bool:
+def remains_simple(outline: Float[np.ndarray, "vertices 2"], moves: Float[np.ndarray, "vertices"]) -> bool:
     """Whether a polygon surely remains one when each vertex moves anywhere, by at most its part of `moves`: then no
     vertex can come to an edge that is not its own."""
     after, reach = np.roll(outline, -1, axis=0), np.maximum(moves, np.roll(moves, -1))

@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.arrays import array
+from wholearm_jax.core.arrays import as_device_array
 
 COORDINATES = ("x", "y", "phi", "theta1", "theta2")
 LINKS = ("palm", "finger1", "finger2")
 VERTEX, EDGE = 0, 1  # contact types: A, an object vertex on a link; B, a fingertip on an object edge
-_CONTACT = re.compile(r"(palm|finger1|finger2):([ve])([0-9]+)( rolling)?")
+_CONTACT_PATTERN = re.compile(r"(palm|finger1|finger2):([ve])([0-9]+)( rolling)?")
 
 
 class MassProperties(NamedTuple):
@@ -63,7 +63,7 @@ class Hand(eqx.Module):
     torque_limit: Float[Array, "2"]
 
 
-class Formation(eqx.Module):
+class ContactFormation(eqx.Module):
     """A contact formation as data: one row a constraint, with the contact's link (0 palm, 1, 2), type (`VERTEX`,
     `EDGE`) and feature number.
 
@@ -97,10 +97,10 @@ class Formation(eqx.Module):
         return tuple((np.cumsum(~np.asarray(self.tangential)) - 1).tolist())
 
 
-class Heading(eqx.Module):
+class PathTarget(eqx.Module):
     """Which way along the wire, and where to stop before its end.
 
-    Travel starts with the sign `sign` in coordinate number `coordinate` (-1: in the one that changes most); the phase
+    Travel starts with the sign `sign` in coordinate number `path_coordinate` (-1: in the one that changes most); the phase
     ends where coordinate number `until_coordinate` reaches `until_value`, or where the formation ends if that is -1.
     """
 
@@ -119,8 +119,8 @@ class Phase(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    formation: Formation
-    heading: Heading
+    formation: ContactFormation
+    heading: PathTarget
     duration: Float[Array, ""]
     arrive: str = eqx.field(static=True, default="rest")
 
@@ -144,7 +144,7 @@ class Scene(eqx.Module):
     phases: tuple[Phase, ...]
 
 
-class Body(eqx.Module):
+class RigidBody(eqx.Module):
     """What the dynamics need of a polygon: vertices about the centre of mass, mass, inertia, friction."""
 
     vertices: Float[Array, "capacity 2"]
@@ -159,38 +159,38 @@ def polygon(vertices, mass, friction, inertia=None, center_of_mass=None) -> Poly
     given = np.asarray(vertices, float)
     padding = np.broadcast_to(given[-1], (-len(given) % 8, 2))
     return Polygon(
-        vertices=array(np.concatenate([given, padding])),
-        count=array(len(given), int),
-        mass=array(mass, float),
-        friction=array(np.broadcast_to(np.asarray(friction, float), (3,))),
-        inertia=None if inertia is None else array(inertia, float),
-        center_of_mass=None if center_of_mass is None else array(center_of_mass, float),
+        vertices=as_device_array(np.concatenate([given, padding])),
+        count=as_device_array(len(given), int),
+        mass=as_device_array(mass, float),
+        friction=as_device_array(np.broadcast_to(np.asarray(friction, float), (3,))),
+        inertia=None if inertia is None else as_device_array(inertia, float),
+        center_of_mass=None if center_of_mass is None else as_device_array(center_of_mass, float),
     )
 
 
-def formation(contacts) -> Formation:
-    """Build a `Formation` from contact names such as `"palm:v5"`, `"finger2:e3"` or `"palm:v6 rolling"`."""
+def contact_formation(contacts) -> ContactFormation:
+    """Build a `ContactFormation` from contact names such as `"palm:v5"`, `"finger2:e3"` or `"palm:v6 rolling"`."""
     rows = []
     for *feature, rolling in map(parse_contact, contacts):
         rows += [(*feature, tangential) for tangential in (False, True)[: 1 + rolling]]
-    return Formation(*(array(column) for column in zip(*rows, strict=True)))
+    return ContactFormation(*(as_device_array(column) for column in zip(*rows, strict=True)))
 
 
-def heading(toward: str | None, until: Mapping[Any, float] | None = None) -> Heading:
-    """Build a `Heading` from a coordinate and a sign (`"x-"`; None: either way) and an optional `{coordinate: value}`
+def path_target(toward: str | None, until: Mapping[Any, float] | None = None) -> PathTarget:
+    """Build a `PathTarget` from a coordinate and a sign (`"x-"`; None: either way) and an optional `{coordinate: value}`
     to stop at."""
     coordinate, value = next(iter(until.items())) if until else (None, 0.0)
-    return Heading(
-        coordinate=array(COORDINATES.index(toward[:-1]) if toward else -1, int),
-        sign=array(-1.0 if toward and toward[-1] == "-" else 1.0, float),
-        until_coordinate=array(-1 if coordinate is None else COORDINATES.index(coordinate), int),
-        until_value=array(value, float),
+    return PathTarget(
+        coordinate=as_device_array(COORDINATES.index(toward[:-1]) if toward else -1, int),
+        sign=as_device_array(-1.0 if toward and toward[-1] == "-" else 1.0, float),
+        until_coordinate=as_device_array(-1 if coordinate is None else COORDINATES.index(coordinate), int),
+        until_value=as_device_array(value, float),
     )
 
 
 def parse_contact(text: str) -> tuple[int, int, int, bool]:
     """`"finger2:e3 rolling"` -> (link, kind, feature, rolling). Raises ValueError for anything else."""
-    match = _CONTACT.fullmatch(text.strip())
+    match = _CONTACT_PATTERN.fullmatch(text.strip())
     if match is None:
         raise ValueError(f"'{text}' is not a contact; write LINK:vN or LINK:eN, e.g. palm:v5 or finger2:e3")
     link, letter, number, rolling = match.groups()
@@ -199,7 +199,7 @@ def parse_contact(text: str) -> tuple[int, int, int, bool]:
     return LINKS.index(link), VERTEX if letter == "v" else EDGE, int(number), rolling is not None
 
 
-def pair_name(contact: str) -> str:
+def feature_pair(contact: str) -> str:
     """The two features of a contact, whether it slides or rolls: `palm:v6` of `palm:v6 rolling`."""
     return contact.partition(" ")[0]
 
@@ -229,13 +229,13 @@ def mass_properties(vertices: Float[Array, "capacity 2"], count: Int[Array, ""])
 
 
 @jax.jit
-def body(shape: Polygon) -> Body:
+def rigid_body(shape: Polygon) -> RigidBody:
     """The polygon about its centre of mass, with the inertia of a uniform density unless the scene gives its own."""
     uniform = mass_properties(shape.vertices, shape.count)
     center = uniform.centroid if shape.center_of_mass is None else shape.center_of_mass
     away = uniform.centroid - center
     own = shape.mass * (uniform.second_moment / uniform.area + away @ away)
-    return Body(
+    return RigidBody(
         vertices=shape.vertices - center,
         count=shape.count,
         mass=shape.mass,
@@ -246,4 +246,4 @@ def body(shape: Polygon) -> Body:
 
 def replace_duration(phase: Phase, duration) -> Phase:
     """A phase with another duration."""
-    return eqx.tree_at(lambda p: p.duration, phase, array(duration, float))
+    return eqx.tree_at(lambda p: p.duration, phase, as_device_array(duration, float))

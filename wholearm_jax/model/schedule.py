@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core.arrays import array
-from wholearm_jax.core.lookup import pick
+from wholearm_jax.core.arrays import as_device_array
+from wholearm_jax.core.lookup import take_row
 
-ROWS = 128  # schedules are padded to a multiple of this: those of like length share compiled programs
-ROUNDING = 16  # times beside each other by this many of a precision's last digits are one
+ROW_MULTIPLE = 128  # schedules are padded to a multiple of this: those of like length share compiled programs
+TIME_ROUNDING = 16  # times beside each other by this many of a precision's last digits are one
 
 
-class Torque(eqx.Module):
-    """A torque schedule: `times` [s], non-decreasing, and `values` [N m], one row `(tau1, tau2)` a time.
+class TorqueSchedule(eqx.Module):
+    """A torque schedule: `fused_matmul` [s], non-decreasing, and `values` [N m], one row `(tau1, tau2)` a time.
 
     A time that stands twice is a step: the first row holds before it, the second from it on.
     """
@@ -25,7 +25,7 @@ class Torque(eqx.Module):
     values: Float[Array, "rows 2"]
 
 
-class Window(eqx.Module):
+class PhaseSchedule(eqx.Module):
     """A schedule seen from one phase: `share` is time in durations of the phase, 0 at its start and 1 at its end.
 
     Interval `k` runs from row `k` to row `k + 1`; those from `first` to `last` cover the phase. `slope` is the torque's
@@ -39,8 +39,8 @@ class Window(eqx.Module):
     last: Int[Array, ""]
 
 
-def torque(times, values) -> Torque:
-    """Build a schedule from `times` `(rows,)` [s] and `values` `(rows, 2)` [N m], linear in between.
+def torque_schedule(times, values) -> TorqueSchedule:
+    """Build a schedule from `fused_matmul` `(rows,)` [s] and `values` `(rows, 2)` [N m], linear in between.
 
     Raises `ValueError` unless there are at least two rows, all finite, with times sorted and none more than twice.
 
@@ -50,7 +50,7 @@ def torque(times, values) -> Torque:
     Traceback (most recent call last):
     ValueError: times must not decrease, and none may stand more than twice
     """
-    times, values = array(times, float), array(values, float)
+    times, values = as_device_array(times, float), as_device_array(values, float)
     clock = np.asarray(times)
     if clock.ndim != 1 or clock.size < 2 or values.shape != (clock.size, 2):
         raise ValueError("a torque schedule needs at least two rows of t, tau1, tau2")
@@ -58,15 +58,15 @@ def torque(times, values) -> Torque:
         raise ValueError("a torque schedule must be finite")
     if np.any(np.diff(clock) < 0) or np.any(clock[2:] == clock[:-2]):
         raise ValueError("times must not decrease, and none may stand more than twice")
-    return Torque(times, values)
+    return TorqueSchedule(times, values)
 
 
-def evenly(duration, values) -> Torque:
+def uniform_schedule(duration, values) -> TorqueSchedule:
     """A schedule of evenly spaced rows from time 0."""
-    return Torque(array(np.linspace(0.0, float(duration), len(values))), array(values))
+    return TorqueSchedule(as_device_array(np.linspace(0.0, float(duration), len(values))), as_device_array(values))
 
 
-def beyond(schedule: Torque, limits) -> list[tuple[int, float, float, float]]:
+def limit_violations(schedule: TorqueSchedule, limits) -> list[tuple[int, float, float, float]]:
     """Joints (1, 2) whose torque goes beyond its limit but for rounding, each with its largest magnitude [N m], when
     that is [s], and its limit."""
     times, sizes = np.asarray(schedule.times), np.abs(np.asarray(schedule.values))
@@ -75,42 +75,42 @@ def beyond(schedule: Torque, limits) -> list[tuple[int, float, float, float]]:
     return [(joint, size, when, limit) for joint, size, when, limit in told if size > limit * (1 + 1e-9)]
 
 
-def in_turn(schedules: list[Torque]) -> Torque:
+def concatenate_schedules(schedules: list[TorqueSchedule]) -> TorqueSchedule:
     """Schedules one after the other, each from time 0; a step where one follows another."""
     begins = np.cumsum([0.0, *(float(np.asarray(s.times)[-1]) for s in schedules[:-1])])
     times = [begin + np.asarray(s.times) for begin, s in zip(begins, schedules, strict=True)]
-    return Torque(*(array(np.concatenate(rows)) for rows in (times, [np.asarray(s.values) for s in schedules])))
+    return TorqueSchedule(*(as_device_array(np.concatenate(rows)) for rows in (times, [np.asarray(s.values) for s in schedules])))
 
 
-def has_steps(schedule: Torque, start: float, end: float) -> bool:
+def has_jumps(schedule: TorqueSchedule, start: float, end: float) -> bool:
     """Whether the schedule steps between two times (a static choice for the integrator); a step that lies at one of
-    them but for rounding does not count, as in `window`."""
+    them but for rounding does not count, as in `restrict_to_phase`."""
     times = np.asarray(schedule.times)
     stepped = times[1:][np.diff(times) == 0]
-    near = rounding(times, start, end)
+    near = time_tolerance(times, start, end)
     return bool(np.any((stepped > start + near) & (stepped < end - near)))
 
 
-def rounding(times: np.ndarray, start: float, end: float) -> float:
-    """How far beside each other two times of a phase from `start` to `end` count as one, as in `window`."""
-    return ROUNDING * np.finfo(times.dtype).eps * (abs(start) + abs(end - start))
+def time_tolerance(times: np.ndarray, start: float, end: float) -> float:
+    """How far beside each other two times of a phase from `start` to `end` count as one, as in `restrict_to_phase`."""
+    return TIME_ROUNDING * np.finfo(times.dtype).eps * (abs(start) + abs(end - start))
 
 
-def rounded(rows: int, multiple: int = ROWS) -> int:
-    """The next multiple: as long as `padded` makes a schedule of `rows`."""
+def round_up(rows: int, multiple: int = ROW_MULTIPLE) -> int:
+    """The next multiple: as long as `pad_schedule` makes a schedule of `rows`."""
     return -(-rows // multiple) * multiple
 
 
 @partial(jax.jit, static_argnames="multiple")
-def padded(schedule: Torque, multiple: int = ROWS) -> Torque:
+def pad_schedule(schedule: TorqueSchedule, multiple: int = ROW_MULTIPLE) -> TorqueSchedule:
     """The same schedule with its last row repeated."""
-    missing = rounded(schedule.times.shape[0], multiple) - schedule.times.shape[0]
+    missing = round_up(schedule.times.shape[0], multiple) - schedule.times.shape[0]
     ramp = schedule.times[-1] + (schedule.times[-1] - schedule.times[0]) * jnp.arange(1, missing + 1)
     rows = jnp.broadcast_to(schedule.values[-1], (missing, 2))
-    return Torque(jnp.concatenate([schedule.times, ramp]), jnp.concatenate([schedule.values, rows]))
+    return TorqueSchedule(jnp.concatenate([schedule.times, ramp]), jnp.concatenate([schedule.values, rows]))
 
 
-def window(schedule: Torque, start: Float[Array, ""], duration: Float[Array, ""]) -> Window:
+def restrict_to_phase(schedule: TorqueSchedule, start: Float[Array, ""], duration: Float[Array, ""]) -> PhaseSchedule:
     """A schedule over one phase. Rows at its start or end but for rounding count as there: the times of phases are
     sums, and those of a file are rounded, so that a step between two phases would else be taken within one."""
     times = schedule.times
@@ -118,11 +118,11 @@ def window(schedule: Torque, start: Float[Array, ""], duration: Float[Array, ""]
     rise = jnp.diff(schedule.values, axis=0)
     slope = jnp.where((gap > 0)[:, None], rise / jnp.where(gap > 0, gap, 1.0)[:, None], 0.0) * duration
     intervals = times.shape[0] - 1
-    near = ROUNDING * jnp.finfo(times.dtype).eps * (jnp.abs(start) + duration)
+    near = TIME_ROUNDING * jnp.finfo(times.dtype).eps * (jnp.abs(start) + duration)
     first = (times <= start + near).sum() - 1
     last = (times < start + duration - near).sum() - 1
     first = jnp.clip(first, 0, intervals - 1)
-    return Window(
+    return PhaseSchedule(
         share=(times - start) / duration,
         values=schedule.values,
         slope=slope,
@@ -131,11 +131,11 @@ def window(schedule: Torque, start: Float[Array, ""], duration: Float[Array, ""]
     )
 
 
-def interval(seen: Window, share: Float[Array, ""]) -> Int[Array, ""]:
+def interval(seen: PhaseSchedule, share: Float[Array, ""]) -> Int[Array, ""]:
     """The interval that holds at a share of the phase; a step belongs to what follows it, except at the phase's end."""
     return jnp.clip((share >= seen.share).sum() - 1, seen.first, seen.last)
 
 
-def torque_in(seen: Window, number: Int[Array, ""], share: Float[Array, ""]) -> Float[Array, "2"]:
+def torque_at(seen: PhaseSchedule, number: Int[Array, ""], share: Float[Array, ""]) -> Float[Array, "2"]:
     """The torque [N m] of one interval at a share of the phase."""
-    return pick(seen.values, number) + pick(seen.slope, number) * (share - pick(seen.share, number))
+    return take_row(seen.values, number) + take_row(seen.slope, number) * (share - take_row(seen.share, number))

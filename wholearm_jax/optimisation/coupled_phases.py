@@ -1,7 +1,7 @@
 """Group: phases that follow one another at speed are one problem, which is descended on from several starts.
 
 A group begins and ends at rest, or with the plan. Where torque rates are limited its first and last torques are those
-that it shares with its neighbours (`handover`). What counts is not what the descent says of its intervals but an
+that it shares with its neighbours (`rest_transition`). What counts is not what the descent says of its intervals but an
 honest simulation of the schedules.
 
 Derivation: section 9 of `docs/derivation.md`.
@@ -16,21 +16,21 @@ import jax
 import numpy as np
 import optax
 
-from wholearm_jax.core.arrays import array
+from wholearm_jax.core.arrays import as_device_array
 from wholearm_jax.core.status import Status
-from wholearm_jax.margin.quasistatic import Bound
+from wholearm_jax.margin.quasistatic import MarginBound
 from wholearm_jax.model.scene import Phase, Scene
-from wholearm_jax.model.schedule import Torque, evenly, in_turn, padded
-from wholearm_jax.optimisation.initial_guess import guesses
+from wholearm_jax.model.schedule import TorqueSchedule, uniform_schedule, concatenate_schedules, pad_schedule
+from wholearm_jax.optimisation.initial_guess import initial_guesses
 from wholearm_jax.optimisation.interior_point import interior_point, projected
 from wholearm_jax.optimisation.linearisation import Limits
-from wholearm_jax.optimisation.multiple_shooting import Variables, further
-from wholearm_jax.optimisation.rest_transition import Handover
-from wholearm_jax.optimisation.solver import CONVERGED, REPEATED, Problem, Step, descend
-from wholearm_jax.phases.phase import Traced, run
-from wholearm_jax.phases.plan import stacked
-from wholearm_jax.phases.result import stays
-from wholearm_jax.simulation.integrator import Integration, with_room
+from wholearm_jax.optimisation.multiple_shooting import Variables, extra_parts
+from wholearm_jax.optimisation.rest_transition import RestTransition
+from wholearm_jax.optimisation.solver import CONVERGED, REPEATED, Problem, IterationRecord, solve
+from wholearm_jax.phases.phase import TracedPhase, simulate_phase
+from wholearm_jax.phases.plan import stack_trees
+from wholearm_jax.phases.result import rest_intervals
+from wholearm_jax.simulation.integrator import IntegratorOptions, with_step_capacity
 
 TORQUE_SHARE = 0.9  # share of the torque limits that a start may use
 SHORTEST = 0.01  # share of its longest time that a phase moves at the least
@@ -38,7 +38,7 @@ GOOD = 0.99  # share of the bound with which no further start is tried
 
 
 @dataclass(frozen=True)
-class Wanted:
+class OptimiseOptions:
     """What `optimise` was asked for; `rows` is the size of the whole plan's schedule: those of one share programs."""
 
     knots: int
@@ -49,20 +49,20 @@ class Wanted:
     passing: float
     optimiser: optax.GradientTransformation | None
     tolerance: float
-    callback: Callable[[Step], None] | None
+    callback: Callable[[IterationRecord], None] | None
 
 
 @dataclass(frozen=True)
-class Group:
+class CoupledPhases:
     """Phases with all that is known of them; `index` is the first one's number."""
 
     index: int
     phases: tuple[Phase, ...]
-    traced: list[Traced]
-    tops: list[Bound]
-    begin: Handover | None  # where torque rates are limited, and a phase stands before
-    end: Handover | None  # or behind
-    wanted: Wanted
+    traced: list[TracedPhase]
+    tops: list[MarginBound]
+    begin: RestTransition | None  # where torque rates are limited, and a phase stands before
+    end: RestTransition | None  # or behind
+    wanted: OptimiseOptions
 
     @property
     def pins(self) -> dict[tuple[int, int], np.ndarray]:
@@ -103,7 +103,7 @@ class Group:
         return Problem(self.index, tables, self.bounds, limits, self.wanted.steps, self.wanted.tolerance)
 
 
-def optimise_group(scene: Scene, group: Group) -> tuple[list[Torque], str, list[Step]]:
+def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> tuple[list[TorqueSchedule], str, list[IterationRecord]]:
     """Descend from one start after the other, until one comes near the bound or two agree.
 
     Returns the best schedules (each from time 0), why their descent stopped, and the steps taken.
@@ -112,8 +112,8 @@ def optimise_group(scene: Scene, group: Group) -> tuple[list[Torque], str, list[
     for at in group.traced:
         if int(at.table.status) != Status.OK:
             why = f"the wire cannot be followed: {Status(int(at.table.status)).label}"
-            return [evenly(t, np.zeros((wanted.knots, 2))) for t in group.durations], why, []
-    begins = guesses([at.table for at in group.traced], group.durations, wanted.knots, TORQUE_SHARE)
+            return [uniform_schedule(t, np.zeros((wanted.knots, 2))) for t in group.durations], why, []
+    begins = initial_guesses([at.table for at in group.traced], group.durations, wanted.knots, TORQUE_SHARE)
     weakest = int(np.argmin(group.bounds))
     if group.bounds[weakest] <= 0:
         where = 100 * float(group.tops[weakest].share)
@@ -122,17 +122,17 @@ def optimise_group(scene: Scene, group: Group) -> tuple[list[Torque], str, list[
     if group.begin is not None and not group.begin.serves:
         return _schedules(group, begins[0]), "no torque lets this formation take over at the limited rate", []
     problem = group.problem(_limits(group))
-    method = descent_method(wanted.optimiser, len(group.phases), further(problem.tables))
+    method = descent_method(wanted.optimiser, len(group.phases), extra_parts(problem.tables))
     found, history = [], []
     for number, start in enumerate(begins):
         for at, torque in group.pins.items():
             start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[at].set(torque))
         ended = [other for fine, _, why, other in found if fine and why == CONVERGED]
-        p, why, taken = descend(problem, start, number, method, wanted.callback, ended)
+        p, why, taken = solve(problem, start, number, method, wanted.callback, ended)
         history += taken
         if why == REPEATED:
             break
-        fine, share = _honest(scene, group, p)
+        fine, share = _verify_by_simulation(scene, group, p)
         best = max((other for ok, other, *_ in found if ok), default=np.nan)
         agree = fine and abs(share - best) <= tolerance
         found.append((fine, share, why, p))
@@ -144,34 +144,34 @@ def optimise_group(scene: Scene, group: Group) -> tuple[list[Torque], str, list[
     return _schedules(group, p), why, history
 
 
-def _schedules(group: Group, p: Variables) -> list[Torque]:
+def _schedules(group: CoupledPhases, p: Variables) -> list[TorqueSchedule]:
     """Each phase's schedule, from time 0."""
     values, lengths = np.asarray(p.torque) * group.limits[:, None], np.exp(np.asarray(p.log_duration))
-    first, *others = [evenly(length, rows) for length, rows in zip(lengths, values, strict=True)]
+    first, *others = [uniform_schedule(length, rows) for length, rows in zip(lengths, values, strict=True)]
     if group.begin is not None and group.begin.lead > 0:
         times = np.append(0.0, group.begin.lead + np.asarray(first.times))
-        first = Torque(array(times), array(np.vstack([group.begin.torque, first.values])))
+        first = TorqueSchedule(as_device_array(times), as_device_array(np.vstack([group.begin.torque, first.values])))
     return [first, *others]
 
 
-def _honest(scene: Scene, group: Group, p: Variables) -> tuple[bool, float]:
+def _verify_by_simulation(scene: Scene, group: CoupledPhases, p: Variables) -> tuple[bool, float]:
     """Whether a simulation of the schedules says `ok`, holds included, and the least margin over its bound."""
     start, shares, fine, arriving = 0.0, [], [], None
-    torque = in_turn(_schedules(group, p))
-    schedule, how = padded(torque, group.wanted.rows), with_room(Integration(), group.wanted.knots)
+    torque = concatenate_schedules(_schedules(group, p))
+    schedule, how = pad_schedule(torque, group.wanted.rows), with_step_capacity(IntegratorOptions(), group.wanted.knots)
     ends = np.cumsum(np.exp(np.asarray(p.log_duration)) + group.lead)
     for phase, at, end, top in zip(group.phases, group.traced, ends, group.bounds, strict=True):
-        one = run(at.table, schedule, start, end - start, how, phase.arrive, arriving)
+        one = simulate_phase(at.table, schedule, start, end - start, how, phase.arrive, arriving)
         start += float(one.duration) * float(np.asarray(one.motion.share)[int(one.motion.count)])
         arriving = one.leaving if phase.arrive == "moving" else None
-        held = stays(scene, torque, phase, at, one)
+        held = rest_intervals(scene, torque, phase, at, one)
         fine.append(int(one.verdict.status) == Status.OK and all(h.lost is None for h in held))
         shares.append(float(one.score.margin) / top)
     least = min(shares)
     return all(fine), least if np.isfinite(least) else -np.inf
 
 
-def _limits(group: Group) -> Limits:
+def _limits(group: CoupledPhases) -> Limits:
     lengths, asked = group.durations, group.wanted
     shortest, longest = (lengths, lengths) if asked.durations is None else (t - group.lead for t in asked.durations)
     rate = np.full(2, np.inf if asked.rate_limit is None else float(asked.rate_limit))
@@ -179,7 +179,7 @@ def _limits(group: Group) -> Limits:
     for at in group.pins:
         pinned[at] = True
     shortest, unit = np.maximum(shortest, SHORTEST * longest), np.maximum(group.bounds, 1e-300)
-    return Limits(*(array(a) for a in (rate, shortest, longest, np.asarray(asked.passing), pinned, unit)))
+    return Limits(*(as_device_array(a) for a in (rate, shortest, longest, np.asarray(asked.passing), pinned, unit)))
 
 
 @functools.cache
@@ -188,4 +188,4 @@ def descent_method(optimiser, phases: int, further: int):
     return interior_point(phases, further) if optimiser is None else projected(optimiser)
 
 
-stacked_tables = jax.jit(stacked)
+stacked_tables = jax.jit(stack_trees)

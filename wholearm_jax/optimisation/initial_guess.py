@@ -10,31 +10,31 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from wholearm_jax.core.arrays import array
+from wholearm_jax.core.arrays import as_device_array
 from wholearm_jax.core.programs import Program
-from wholearm_jax.dynamics.path_dynamics import Table
-from wholearm_jax.margin.quasistatic import holds
-from wholearm_jax.optimisation.linearisation import passed_on
+from wholearm_jax.dynamics.path_dynamics import PathDynamics
+from wholearm_jax.margin.quasistatic import best_quasistatic_torque_batch
+from wholearm_jax.optimisation.linearisation import impact_speed_ratio
 from wholearm_jax.optimisation.multiple_shooting import Variables
 
-PROFILES = tuple((p, q) for p in (1.0, 2.0, 4.0, 8.0, 16.0) for q in (1.0, 2.0, 4.0, 8.0, 16.0))
+SPEED_PROFILES = tuple((p, q) for p in (1.0, 2.0, 4.0, 8.0, 16.0) for q in (1.0, 2.0, 4.0, 8.0, 16.0))
 FINE = 8  # steps a knot interval in which a profile's speed is summed
 EVEN = 0.3  # share of the even motion in every profile, so that the object never quite stops on the way
 SPEEDS = (1.0, 0.4, 2.0)  # speeds at changes of formation to start from [wire lengths a duration]
-OTHERS = ((16.0, 1.0), (1.0, 1.0), (1.0, 16.0))  # further starts: a long dwell first, none, a long dwell last
+FALLBACK_PROFILES = ((16.0, 1.0), (1.0, 1.0), (1.0, 16.0))  # further starts: a long dwell first, none, a long dwell last
 
 
-def guesses(tables: list[Table], durations, knots: int, share: float) -> list[Variables]:
+def initial_guesses(tables: list[PathDynamics], durations, knots: int, share: float) -> list[Variables]:
     """Motions with the torques that give them, within a `share` of the limits, by the best squeeze.
 
-    One phase goes from rest to rest: first that of `PROFILES` with the largest margin (the even one unless another
-    gains more than 2 %), then `OTHERS`. Several go through their changes of formation at each of `SPEEDS`.
+    One phase goes from rest to rest: first that of `SPEED_PROFILES` with the largest margin (the even one unless another
+    gains more than 2 %), then `FALLBACK_PROFILES`. Several go through their changes of formation at each of `BOUND_SPEEDS`.
     """
     if len(tables) == 1:
         motions = _profiles(knots)
         torque, margins = _squeezed(tables[0], durations[0], motions, share)
         best = 0 if margins[0] >= margins.max() - 0.02 * abs(margins.max()) else int(np.argmax(margins))
-        order = [best, *(PROFILES.index(other) for other in OTHERS if PROFILES[best] != other)]
+        order = [best, *(SPEED_PROFILES.index(other) for other in FALLBACK_PROFILES if SPEED_PROFILES[best] != other)]
         return [_variables([torque[k]], [motions[k]], durations) for k in order]
     ratios = [float(_passed_on(*pair)) for pair in itertools.pairwise(tables)]
     found = []
@@ -42,7 +42,7 @@ def guesses(tables: list[Table], durations, knots: int, share: float) -> list[Va
         entry, motions, torques = 0.0, [], []
         for k, (table, length) in enumerate(zip(tables, durations, strict=True)):
             leave = 0.0 if k == len(tables) - 1 else speed
-            motions.append(_between(knots, entry, leave))
+            motions.append(_cubic_motion(knots, entry, leave))
             torques.append(_squeezed(table, length, motions[-1:], share)[0][0])
             if k < len(tables) - 1:
                 entry = ratios[k] * leave * float(table.length) / length
@@ -54,7 +54,7 @@ def guesses(tables: list[Table], durations, knots: int, share: float) -> list[Va
 def _squeezed(table, time: float, motions, share: float):
     """Torques at the knots, in units of their limits, and the least forces [N] there, of motions over them."""
     full = np.asarray(table.torque_limit)
-    tight = eqx.tree_at(lambda t: t.torque_limit, table, array(share * full))
+    tight = eqx.tree_at(lambda t: t.torque_limit, table, as_device_array(share * full))
     breaks = np.asarray(table.breaks)
     length, first = float(breaks[-1] - breaks[0]), float(breaks[0])
     s, v, a = (np.stack(rows) for rows in zip(*motions, strict=True))
@@ -65,10 +65,10 @@ def _squeezed(table, time: float, motions, share: float):
 def _variables(torques, motions, durations) -> Variables:
     state = np.stack([np.stack(motion[:2], axis=1) for motion in motions])
     state[:, 0, 0], state[:, -1, 0], state[-1, -1, 1] = 0.0, 1.0, 0.0
-    return Variables(array(np.stack(torques)), array(state), array(np.log(durations)))
+    return Variables(as_device_array(np.stack(torques)), as_device_array(state), as_device_array(np.log(durations)))
 
 
-def _between(knots: int, entry: float, leave: float):
+def _cubic_motion(knots: int, entry: float, leave: float):
     """Motion over a unit length and time with given speeds at its ends: a cubic."""
     u = np.linspace(0.0, 1.0, knots)
     s = np.polynomial.Polynomial([0.0, entry, 3 - 2 * entry - leave, entry + leave - 2])
@@ -77,8 +77,8 @@ def _between(knots: int, entry: float, leave: float):
 
 @functools.cache
 def _profiles(knots: int):
-    """All of `PROFILES`, which are the same for every plan."""
-    return [_profile(knots, *powers) for powers in PROFILES]
+    """All of `SPEED_PROFILES`, which are the same for every plan."""
+    return [_profile(knots, *powers) for powers in SPEED_PROFILES]
 
 
 def _profile(knots: int, p: float, q: float):
@@ -97,9 +97,9 @@ def _profile(knots: int, p: float, q: float):
     return tuple(row[::FINE] for row in motion)
 
 
-_holds = Program(jax.vmap(holds, (None, 0, 0, 0)))
+_holds = Program(jax.vmap(best_quasistatic_torque_batch, (None, 0, 0, 0)))
 
 
 @jax.jit
 def _passed_on(before, after):
-    return passed_on(*(jax.tree.map(lambda a: a[None], table) for table in (before, after)))[0]
+    return impact_speed_ratio(*(jax.tree.map(lambda a: a[None], table) for table in (before, after)))[0]

@@ -11,7 +11,7 @@ that maximum, the products `slack * price = T w` being unknowns of their own (a 
 curvature of the simulation itself is left out (Gauss-Newton). It is an optax gradient transformation, and any other
 optax optimiser may take its place (`projected`).
 
-A step follows the curve on which accelerations and squeezes at the knots change evenly (`moved`): on it the intervals
+A step follows the curve on which accelerations and squeezes at the knots change evenly (`retract`): on it the intervals
 are nearly linear. One that raises the loss, with a penalty on `|e|`, by more than a descent's `rise` is taken again
 with a part of its length; and where limits leave only tiny steps, the temperature rises again, and stays above the one
 at which that happened.
@@ -31,36 +31,36 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from wholearm_jax.core.programs import Program
-from wholearm_jax.dynamics.path_dynamics import Table
-from wholearm_jax.margin.contact_forces import smooth_margin
+from wholearm_jax.dynamics.path_dynamics import PathDynamics
+from wholearm_jax.margin.contact_forces import log_barrier_minimum
 from wholearm_jax.margin.quasistatic import acceleration_terms
 from wholearm_jax.optimisation.linearisation import (
     Limits,
-    Linear,
-    change_of_rooms,
-    gather,
+    LinearisedProblem,
+    jacobian_product,
+    jacobian_transpose_product,
     linearise,
     of_states,
-    rooms_of,
+    slack_sizes,
 )
 from wholearm_jax.optimisation.multiple_shooting import Variables
-from wholearm_jax.optimisation.riccati import nearest, newton_step
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.optimisation.riccati import project_step, kkt_step
+from wholearm_jax.simulation.integrator import IntegratorOptions
 
-HOTTEST, COLDEST = 0.1, 1e-4  # temperatures, as shares of the bound
+MU_MAX, MU_MIN = 0.1, 1e-4  # temperatures, as shares of the bound
 NEAR = 0.95  # share of the way to a limit that a step may go
 LEAST = 0.05  # slack that a room starts with at least
 LONGEST = (0.1, 0.5)  # most that `s` and `v` at a knot may change in a step [lengths, lengths a duration]
 SHORTER = 0.25  # a step that leaves what can be simulated is taken again with this share of it
 SMALL = 1e-3  # a share of a step that is taken whatever becomes of the merit
 EDGE = 1e-3  # room below which the merit's logarithm goes on as its tangent
-JAMMED = 0.02  # share of a step, below which limits count as leaving no way: the temperature rises `WARMER` times
-WARMER = 3.0
-FLOOR, WARMEST = 4.0, 0.01  # a jam at the coldest makes that so many times warmer, but no warmer than this
-JOINED = 1e-9  # sum of the defects below which the intervals count as joined
+STALL_STEP = 0.02  # share of a step, below which limits count as leaving no way: the temperature rises `MU_INCREASE` times
+MU_INCREASE = 3.0
+MU_MIN_INCREASE, MU_MIN_MAX = 4.0, 0.01  # a jam at the coldest makes that so many times warmer, but no warmer than this
+DEFECT_TOL = 1e-9  # sum of the defects below which the intervals count as joined
 
 
-class Duals(NamedTuple):
+class InteriorPointState(NamedTuple):
     """The interior point's own unknowns: slack and price of every room, with the intervals that their parts were of
     (`owner`), the level `m` of the margin (NaN: not yet chosen), the temperature and the `coldest` that it may become,
     the shares of its last step that were taken, and the largest price of joining the intervals."""
@@ -78,17 +78,17 @@ class Duals(NamedTuple):
 def interior_point(phases: int, further: int) -> optax.GradientTransformationExtraArgs:
     """The primal-dual direction as an optax transformation; wants `linear=`, and makes its own gradient from it.
 
-    `further` is how many parts intervals may have beyond one each (`shooting.further`).
+    `extra_parts` is how many parts intervals may have beyond one each (`shooting.extra_parts`).
     """
 
     def init(params):
         knots = (params.shape[0] // phases - 1) // 4
-        shape = (phases, knots - 1 + further, rooms_of(knots))
-        level, hot, cold = (jnp.full((), value) for value in (jnp.nan, HOTTEST, COLDEST))
+        shape = (phases, knots - 1 + further, slack_sizes(knots))
+        level, hot, cold = (jnp.full((), value) for value in (jnp.nan, MU_MAX, MU_MIN))
         owner = jnp.zeros(shape[:2], int)
-        return Duals(jnp.ones(shape), jnp.zeros(shape), owner, level, hot, cold, jnp.zeros(2), jnp.zeros(()))
+        return InteriorPointState(jnp.ones(shape), jnp.zeros(shape), owner, level, hot, cold, jnp.zeros(2), jnp.zeros(()))
 
-    def update(updates, state: Duals, params=None, *, linear: Linear, damping, **_):
+    def update(updates, state: InteriorPointState, params=None, *, linear: LinearisedProblem, damping, **_):
         at, bears, hot = linear.at, linear.bears, state.temperature
         live = linear.weight > 0
         least = jnp.where(live & (bears > 0), at.room, jnp.inf).min()
@@ -102,22 +102,22 @@ def interior_point(phases: int, further: int) -> optax.GradientTransformationExt
         stiff = price / slack
         miss = given - slack
         aim = jnp.where(live, target - stiff * miss, 0.0)
-        way, rise, joining = newton_step(linear, stiff, aim, damping)
-        dslack = change_of_rooms(linear, way) - bears * rise + miss
+        way, rise, joining = kkt_step(linear, stiff, aim, damping)
+        dslack = jacobian_product(linear, way) - bears * rise + miss
         dslack = jnp.where(live, dslack, 0.0)
         dprice = jnp.where(live, target - price - stiff * dslack, 0.0)
-        primal = jnp.minimum(_reach(slack, dslack), _cap(linear, way))
-        dual = _reach(price, dprice)
+        primal = jnp.minimum(_fraction_to_boundary(slack, dslack), _step_cap(linear, way))
+        dual = _fraction_to_boundary(price, dprice)
         both = jnp.minimum(primal, dual)
-        cooling = jnp.select([both > 0.5, both > 0.2, both > JAMMED], [0.2, 0.6, 1.0], WARMER)
-        floor = (both < JAMMED) & (hot < 2 * state.coldest)
-        coldest = jnp.where(floor, jnp.minimum(FLOOR * state.coldest, WARMEST), state.coldest)
-        state = Duals(
+        cooling = jnp.select([both > 0.5, both > 0.2, both > STALL_STEP], [0.2, 0.6, 1.0], MU_INCREASE)
+        floor = (both < STALL_STEP) & (hot < 2 * state.coldest)
+        coldest = jnp.where(floor, jnp.minimum(MU_MIN_INCREASE * state.coldest, MU_MIN_MAX), state.coldest)
+        state = InteriorPointState(
             slack + primal * dslack,
             price + dual * dprice,
             linear.owner,
             level + primal * rise,
-            jnp.clip(hot * cooling, coldest, HOTTEST),
+            jnp.clip(hot * cooling, coldest, MU_MAX),
             coldest,
             jnp.stack([primal, dual]),
             jnp.abs(joining).max(),
@@ -127,20 +127,20 @@ def interior_point(phases: int, further: int) -> optax.GradientTransformationExt
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
 
 
-def _reach(value, change):
+def _fraction_to_boundary(value, change):
     """The share of a change that keeps every value positive."""
     falls = change < 0
     return jnp.minimum(1.0, NEAR * jnp.where(falls, -value / jnp.where(falls, change, 1.0), jnp.inf).min())
 
 
-def _cap(linear: Linear, way):
+def _step_cap(linear: LinearisedProblem, way):
     """The share of a step that keeps the states' changes within `LONGEST`."""
     change = jnp.abs(way[of_states(linear)].reshape(-1, 2)).max(0)
     return (jnp.array(LONGEST) / jnp.maximum(change, 1e-30)).min()
 
 
 class Cooling(NamedTuple):
-    """State of `projected`: the inner optimiser's, the level `m` of the smooth margin, and as in `Duals`. Its steps
+    """State of `projected`: the inner optimiser's, the level `m` of the smooth margin, and as in `InteriorPointState`. Its steps
     keep the intervals joined, as far as they are linear: that has no price."""
 
     inner: optax.OptState
@@ -157,23 +157,23 @@ def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) ->
     optimiser = optax.with_extra_args_support(optimiser)
 
     def init(params):
-        level, hot, cold = (jnp.full((), value) for value in (jnp.nan, HOTTEST, COLDEST))
+        level, hot, cold = (jnp.full((), value) for value in (jnp.nan, MU_MAX, MU_MIN))
         return Cooling(optimiser.init(params), level, hot, cold, jnp.zeros(2), jnp.zeros(()))
 
-    def update(updates, state: Cooling, params=None, *, linear: Linear, **extra):
+    def update(updates, state: Cooling, params=None, *, linear: LinearisedProblem, **extra):
         at, hot = linear.at, state.temperature
-        _, level = smooth_margin(at.room, linear.weight * linear.bears, hot)
+        _, level = log_barrier_minimum(at.room, linear.weight * linear.bears, hot)
         above = at.room - linear.bears * level
         # Outside a limit the loss is infinite: there the pull back to it is that of a small room.
-        pull = gather(linear, hot * linear.weight / jnp.maximum(above, hot))
+        pull = jacobian_transpose_product(linear, hot * linear.weight / jnp.maximum(above, hot))
         joined = linear._replace(defect=jnp.zeros_like(linear.defect))
-        gradient = nearest(joined, -pull).at[of_states(linear)].set(0.0)
+        gradient = project_step(joined, -pull).at[of_states(linear)].set(0.0)
         updates, inner = optimiser.update(gradient, state.inner, params, **extra)
-        way = nearest(linear, jnp.asarray(updates).at[of_states(linear)].set(0.0))
-        change = change_of_rooms(linear, way)
+        way = project_step(linear, jnp.asarray(updates).at[of_states(linear)].set(0.0))
+        change = jacobian_product(linear, way)
         within = (linear.weight > 0) & (linear.bears == 0) & (at.room > 0)
-        reach = _reach(jnp.where(within, at.room, 1.0), jnp.where(within, change, 0.0))
-        share = jnp.minimum(reach, _cap(linear, way))
+        reach = _fraction_to_boundary(jnp.where(within, at.room, 1.0), jnp.where(within, change, 0.0))
+        share = jnp.minimum(reach, _step_cap(linear, way))
         cooled = jnp.maximum(cooling * hot, state.coldest)
         after = Cooling(inner, level, cooled, state.coldest, jnp.stack([share, share]), state.joining)
         return share * way, after
@@ -181,7 +181,7 @@ def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) ->
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
 
 
-def moved(p: Variables, way: Variables, share, tables: Table, limits: Limits) -> Variables:
+def retract(p: Variables, way: Variables, share, tables: PathDynamics, limits: Limits) -> Variables:
     """`p` after a `share` of a direction, on the curve along which accelerations and squeezes at knots change evenly.
 
     Torques balance to a small remainder, the acceleration: where the state at a knot moves, they have to move with it.
@@ -219,10 +219,10 @@ def moved(p: Variables, way: Variables, share, tables: Table, limits: Limits) ->
     )
 
 
-class Descent(NamedTuple):
+class SolverState(NamedTuple):
     """A descent on its way: variables, the optimiser's state, and the step that led here, to take again if it failed.
 
-    `least` is each phase's smallest sampled force over its unit and `apart` the sum of the defects, both of the
+    `plan_margin` is each phase's smallest sampled force over its unit and `apart` the sum of the defects, both of the
     variables before the step (NaN where those were not kept). `reach` is the part of a step that is taken. `merit` is
     that of the variables before the step at the temperature `hot`, and `rise` the most by which the step may raise it;
     where that is infinite the merit is not computed, and is infinite too. `damping` is the price of the step's size (of
@@ -243,35 +243,35 @@ class Descent(NamedTuple):
     hot: Float[Array, ""]
 
 
-def merit(linear: Linear, hot, joining) -> Float[Array, ""]:
+def merit(linear: LinearisedProblem, hot, joining) -> Float[Array, ""]:
     """What steps shall lower: the loss at a temperature, and a penalty of twice the price of `joining` on `|e|`.
 
     Where a room is none, as a start may have it, its logarithm goes on as a tangent.
     """
     at, bears = linear.at, linear.bears
-    margin, _ = smooth_margin(at.room, linear.weight * bears, hot)
+    margin, _ = log_barrier_minimum(at.room, linear.weight * bears, hot)
     weight = linear.weight * (1 - bears)
     room = jnp.where(weight > 0, at.room, 1.0)
     log = jnp.where(room > EDGE, jnp.log(jnp.maximum(room, EDGE)), math.log(EDGE) + (room - EDGE) / EDGE)
-    return -margin - hot * (weight * log).sum() + 2 * joining * _apart(linear)
+    return -margin - hot * (weight * log).sum() + 2 * joining * defect_norm(linear)
 
 
-def _apart(linear: Linear):
+def defect_norm(linear: LinearisedProblem):
     return jnp.abs(linear.defect).sum()
 
 
 @Program
-def begin(p: Variables, optimiser) -> Descent:
+def init_solver(p: Variables, optimiser) -> SolverState:
     """A descent before its first step."""
     zero, still = jnp.zeros(()), jax.tree.map(jnp.zeros_like, p)
     state = optimiser.init(ravel_pytree(p)[0])
     worst = zero + jnp.inf  # no step is worse
     unknown = 0 * p.log_duration
-    return Descent(p, state, p, still, zero + 1, unknown, zero, zero + 1, worst, zero, worst, state.temperature)
+    return SolverState(p, state, p, still, zero + 1, unknown, zero, zero + 1, worst, zero, worst, state.temperature)
 
 
 @Program
-def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimiser) -> Descent:
+def take_step(d: SolverState, tables: PathDynamics, limits: Limits, how: IntegratorOptions, optimiser) -> SolverState:
     """Simulate, and take a step; where `d.p` cannot be simulated or is worse, go back and take a shorter one."""
     linear = linearise(d.p, tables, limits, how)
     at = linear.at
@@ -279,18 +279,18 @@ def advance(d: Descent, tables: Table, limits: Limits, how: Integration, optimis
     held = jnp.isfinite(d.rise)
     better = jax.lax.cond(held, lambda: merit(linear, d.hot, d.state.joining) <= d.merit + d.rise, lambda: held | True)
     least = jnp.where((linear.weight > 0) & (linear.bears > 0), at.room, jnp.inf).min((1, 2))
-    apart = _apart(linear)
+    apart = defect_norm(linear)
 
     def onward():
         flat, unravel = ravel_pytree(d.p)
         way, state = optimiser.update(jnp.zeros_like(flat), d.state, flat, linear=linear, damping=d.damping)
         hot = d.state.temperature
         here = jax.lax.cond(held, lambda: merit(linear, hot, state.joining), lambda: jnp.full_like(d.merit, jnp.inf))
-        return Descent(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart, d.reach, d.rise, d.damping, here, hot)
+        return SolverState(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart, d.reach, d.rise, d.damping, here, hot)
 
     def again():
         least, apart = (jnp.full_like(a, jnp.nan) for a in (d.least, d.apart))
         return d._replace(share=d.share * SHORTER, least=least, apart=apart)
 
     after = jax.lax.cond(sound & (better | (d.share < SMALL)), onward, again)
-    return after._replace(p=moved(after.before, after.way, after.share * after.reach, tables, limits))
+    return after._replace(p=retract(after.before, after.way, after.share * after.reach, tables, limits))

@@ -14,10 +14,10 @@ from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.dynamics.path_dynamics import Table, change, on_panel, powers
-from wholearm_jax.margin.contact_forces import spare
-from wholearm_jax.optimisation.multiple_shooting import PACES, ROWS, Samples, Variables, local, samples_of, shoot
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.dynamics.path_dynamics import PathDynamics, resolve_impact, evaluate, locate_panel
+from wholearm_jax.margin.contact_forces import is_duplicate_facet
+from wholearm_jax.optimisation.multiple_shooting import SPEED_COEFFICIENTS, ROWS, Samples, Variables, interval_inputs, samples_of, simulate_intervals
+from wholearm_jax.simulation.integrator import IntegratorOptions
 
 
 class Limits(eqx.Module):
@@ -37,7 +37,7 @@ class Limits(eqx.Module):
 OF_PHASES = Limits(rate=False, shortest=True, longest=True, passing=False, pinned=True, unit=True)  # pyright: ignore
 
 
-class Rooms(NamedTuple):
+class Slacks(NamedTuple):
     """What must stay positive in each part of the intervals (forces over the margin, the others over zero), and the
     states in which the intervals end."""
 
@@ -45,13 +45,13 @@ class Rooms(NamedTuple):
     end: Float[Array, "phases intervals 2"]
 
 
-class Linear(NamedTuple):
+class LinearisedProblem(NamedTuple):
     """All intervals at `p` with derivatives: `at` and `rates` (last axis: an interval's seven numbers); the rooms'
-    `weight` (0: does not exist), the interval that each part is of (`Shot.owner`); what must vanish, `defect`, and its
+    `weight` (0: does not exist), the interval that each part is of (`IntervalResults.owner`); what must vanish, `defect`, and its
     derivatives `across`; `bears` marks the rooms that the margin lowers, `still` the variables that stay."""
 
-    at: Rooms
-    rates: Rooms
+    at: Slacks
+    rates: Slacks
     weight: Float[Array, "phases parts rooms"]
     owner: Int[Array, "phases parts"]
     defect: Float[Array, "e"]
@@ -60,31 +60,31 @@ class Linear(NamedTuple):
     still: Bool[Array, "p"]
 
 
-def rooms(q: Float[Array, "phases intervals 7"], tables: Table, limits: Limits, how: Integration):
+def inequality_slacks(q: Float[Array, "phases intervals 7"], tables: PathDynamics, limits: Limits, how: IntegratorOptions):
     """All intervals of phases that follow one another at speed, one phase after the other: rooms, and what has no
-    derivatives, `weight` and `owner` of `Linear`."""
+    derivatives, `weight` and `owner` of `LinearisedProblem`."""
     phases, intervals = q.shape[:2]
     slowest = jnp.zeros((phases, intervals)).at[:, 0].set(limits.passing).at[0, 0].set(-jnp.inf)
     own, shared = eqx.partition(limits, OF_PHASES)
 
     def one(phase):
         q, slowest, table, own = phase
-        shot = shoot(table, how, intervals, q)
+        shot = simulate_intervals(table, how, intervals, q)
         first = jnp.arange(shot.owner.size) < intervals
         least = jnp.where(first, slowest[shot.owner], 0.0)
-        each = jax.vmap(partial(_rooms, intervals), (0, 0, 0, 0, None, None))
+        each = jax.vmap(partial(_interval_slacks, intervals), (0, 0, 0, 0, None, None))
         room, weight = each(q[shot.owner], shot.parts, first, least, table, eqx.combine(own, shared))
-        return Rooms(room, shot.end), (stop_gradient(weight), shot.owner)
+        return Slacks(room, shot.end), (stop_gradient(weight), shot.owner)
 
     return jax.lax.map(one, (q, slowest, tables, own))
 
 
-def rooms_of(knots: int) -> int:
-    """How many rooms `_rooms` has."""
-    return samples_of(knots - 1) * ROWS + 8 + 4 + PACES + 2
+def slack_sizes(knots: int) -> int:
+    """How many rooms `_interval_slacks` has."""
+    return samples_of(knots - 1) * ROWS + 8 + 4 + SPEED_COEFFICIENTS + 2
 
 
-def _rooms(intervals: int, q: Float[Array, "7"], part: Samples, first, slowest, table: Table, limits: Limits):
+def _interval_slacks(intervals: int, q: Float[Array, "7"], part: Samples, first, slowest, table: PathDynamics, limits: Limits):
     """One part of an interval, and their weights; what does not depend on the part belongs to the `first`. `slowest` is
     the least speed with which it may begin, and -inf where it starts at rest; `limits` are those of its phase."""
     torque, log = q[2:6], q[6]
@@ -98,7 +98,7 @@ def _rooms(intervals: int, q: Float[Array, "7"], part: Samples, first, slowest, 
     pace = part.pace.at[0].add(-jnp.where(later, slowest, 0.0))
     room = [(part.forces / limits.unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, pace, ends]
     one = first / intervals
-    sampled = (part.weight[:, None] * ~spare(table)).ravel()
+    sampled = (part.weight[:, None] * ~is_duplicate_facet(table)).ravel()
     climbs = jnp.tile(jnp.where(bounded, one / 4, 0.0), 2)
     # From rest the first coefficient is the speed, zero, and the second the acceleration.
     paces = part.pace_weight.at[0].multiply(later).at[1].multiply(later | ~limits.pinned[0])
@@ -106,15 +106,15 @@ def _rooms(intervals: int, q: Float[Array, "7"], part: Samples, first, slowest, 
     return jnp.concatenate(room), jnp.concatenate(weight)
 
 
-def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> Linear:
+def linearise(p: Variables, tables: PathDynamics, limits: Limits, how: IntegratorOptions) -> LinearisedProblem:
     """Simulate all intervals, with first derivatives by forward mode: all depend on numbers of their own, so that
     seven directions serve them all."""
     phases, knots = p.torque.shape[:2]
-    q = local(p)
+    q = interval_inputs(p)
 
     def along(way):
         changes = jnp.broadcast_to(way, q.shape)
-        return jax.jvp(lambda q: rooms(q, tables, limits, how), (q,), (changes,), has_aux=True)
+        return jax.jvp(lambda q: inequality_slacks(q, tables, limits, how), (q,), (changes,), has_aux=True)
 
     at, rates, (weight, owner) = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(7))
     columns, ends = _columns(phases, knots)
@@ -127,10 +127,10 @@ def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> 
     flat, unravel = ravel_pytree(p)
 
     def seams(x):
-        return _seams(unravel(x), tables)
+        return _linkage_defects(unravel(x), tables)
 
-    bears = np.arange(rooms_of(knots)) < samples_of(knots - 1) * ROWS
-    return Linear(
+    bears = np.arange(slack_sizes(knots)) < samples_of(knots - 1) * ROWS
+    return LinearisedProblem(
         at,
         rates,
         weight,
@@ -138,11 +138,11 @@ def linearise(p: Variables, tables: Table, limits: Limits, how: Integration) -> 
         jnp.concatenate([defect, seams(flat)]),
         jnp.concatenate([across, jax.jacfwd(seams)(flat)]),
         jnp.asarray(bears * 1.0),
-        _still(limits, phases, knots),
+        _fixed_variables(limits, phases, knots),
     )
 
 
-def _seams(p: Variables, tables: Table) -> Float[Array, "seams"]:
+def _linkage_defects(p: Variables, tables: PathDynamics) -> Float[Array, "seams"]:
     """What must vanish where one phase takes over from another at speed: the error of the speed after the impact, and
     the torques' steps.
 
@@ -153,16 +153,16 @@ def _seams(p: Variables, tables: Table) -> Float[Array, "seams"]:
         return jnp.zeros(0)
     before, after = (jax.tree.map(lambda a, k=k: a[k], tables) for k in (slice(0, -1), slice(1, None)))
     speed = before.length / jnp.exp(p.log_duration[:-1]) * p.state[:-1, -1, 1]
-    lost = p.state[1:, 0, 1] - passed_on(before, after) * speed * jnp.exp(p.log_duration[1:]) / after.length
+    lost = p.state[1:, 0, 1] - impact_speed_ratio(before, after) * speed * jnp.exp(p.log_duration[1:]) / after.length
     return jnp.concatenate([lost, (p.torque[1:, 0] - p.torque[:-1, -1]).ravel()])
 
 
-def passed_on(before: Table, after: Table) -> Float[Array, "seams"]:
+def impact_speed_ratio(before: PathDynamics, after: PathDynamics) -> Float[Array, "seams"]:
     """`ds/dt` after the change of formation over that before it, tables stacked along the first axis."""
 
     def one(before, after):
-        panel, xi = powers(before, before.count - 1, before.breaks[-1])
-        return change(after, on_panel(before.velocity, panel, xi)).speed
+        panel, xi = locate_panel(before, before.count - 1, before.breaks[-1])
+        return resolve_impact(after, evaluate(before.velocity, panel, xi)).speed
 
     return jax.vmap(one)(before, after)
 
@@ -175,7 +175,7 @@ def _columns(phases: int, knots: int) -> tuple[Int[np.ndarray, "phases intervals
     return np.concatenate([state[:, :-1], torque[:, :-1], torque[:, 1:], duration], axis=2), state[:, 1:]
 
 
-def _still(limits: Limits, phases: int, knots: int) -> Bool[Array, "p"]:
+def _fixed_variables(limits: Limits, phases: int, knots: int) -> Bool[Array, "p"]:
     """Pinned torques, the places where wires start and end, rest at the first start and last end, fixed durations."""
     ends = np.zeros((phases, knots, 2), bool)
     ends[:, [0, -1], 0] = ends[0, 0] = ends[-1, -1] = True
@@ -183,47 +183,47 @@ def _still(limits: Limits, phases: int, knots: int) -> Bool[Array, "p"]:
     return jnp.concatenate([jnp.repeat(limits.pinned.ravel(), 2), jnp.asarray(ends.ravel()), fixed])
 
 
-def sizes(linear: Linear) -> tuple[int, int]:
+def sizes(linear: LinearisedProblem) -> tuple[int, int]:
     """Phases and knots."""
     phases, intervals = linear.at.end.shape[:2]
     return phases, intervals + 1
 
 
-def of_states(linear: Linear) -> slice:
+def of_states(linear: LinearisedProblem) -> slice:
     """Where the states stand in the flattened `Variables`."""
     phases, knots = sizes(linear)
     return slice(2 * phases * knots, 4 * phases * knots)
 
 
-def columns(linear: Linear) -> Int[np.ndarray, "phases intervals 7"]:
+def columns(linear: LinearisedProblem) -> Int[np.ndarray, "phases intervals 7"]:
     """Where in the flattened `Variables` each interval's seven numbers stand."""
     return _columns(*sizes(linear))[0]
 
 
-def scattered(linear: Linear, values: Float[Array, "phases intervals 7"]) -> Float[Array, "p"]:
+def scatter_add(linear: LinearisedProblem, values: Float[Array, "phases intervals 7"]) -> Float[Array, "p"]:
     """Numbers of each interval's own seven variables, summed for each variable; zero for those that stay."""
     return jnp.where(linear.still, 0.0, jnp.zeros(linear.still.shape[0]).at[columns(linear)].add(values))
 
 
-def _by_interval(linear: Linear, values: Float[Array, "phases parts *rest"]) -> Float[Array, "phases intervals *rest"]:
+def _by_interval(linear: LinearisedProblem, values: Float[Array, "phases parts *rest"]) -> Float[Array, "phases intervals *rest"]:
     """Numbers of each part, summed for its interval."""
     phases, intervals = linear.at.end.shape[:2]
     at = np.arange(phases)[:, None], linear.owner[:, intervals:]
     return values[:, :intervals].at[at].add(values[:, intervals:])
 
 
-def gather(linear: Linear, values: Float[Array, "phases parts rooms"]) -> Float[Array, "p"]:
+def jacobian_transpose_product(linear: LinearisedProblem, values: Float[Array, "phases parts rooms"]) -> Float[Array, "p"]:
     """`J^T values`, with `J` the derivatives of all rooms."""
-    return scattered(linear, _by_interval(linear, jnp.einsum("pkr,pkrq->pkq", values, linear.rates.room)))
+    return scatter_add(linear, _by_interval(linear, jnp.einsum("pkr,pkrq->pkq", values, linear.rates.room)))
 
 
-def blocks(linear: Linear, values: Float[Array, "phases parts rooms"]) -> Float[Array, "phases intervals 7 7"]:
+def gauss_newton_blocks(linear: LinearisedProblem, values: Float[Array, "phases parts rooms"]) -> Float[Array, "phases intervals 7 7"]:
     """`J^T diag(values) J` for each interval's own seven variables."""
     rates = linear.rates.room
     return _by_interval(linear, jnp.einsum("pkr,pkrq,pkrs->pkqs", values, rates, rates))
 
 
-def change_of_rooms(linear: Linear, way: Float[Array, "p"]) -> Float[Array, "phases parts rooms"]:
+def jacobian_product(linear: LinearisedProblem, way: Float[Array, "p"]) -> Float[Array, "phases parts rooms"]:
     """`J way`."""
     own = jnp.take_along_axis(way[columns(linear)], linear.owner[..., None], axis=1)
     return jnp.einsum("pkrq,pkq->pkr", linear.rates.room, own)

@@ -19,52 +19,52 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.core.arrays import array
-from wholearm_jax.core.programs import Beside, Program, beside, wait
+from wholearm_jax.core.arrays import as_device_array
+from wholearm_jax.core.programs import BackgroundCall, Program, call_in_background, wait_for
 from wholearm_jax.core.status import Status
 from wholearm_jax.core.validation import require_positive, require_x64
-from wholearm_jax.dynamics.path_dynamics import blank
-from wholearm_jax.margin.quasistatic import Bound, bound
+from wholearm_jax.dynamics.path_dynamics import placeholder_dynamics
+from wholearm_jax.margin.quasistatic import MarginBound, margin_upper_bound
 from wholearm_jax.model.scene import Phase, Scene, replace_duration
-from wholearm_jax.model.schedule import Torque, evenly, in_turn, rounded
+from wholearm_jax.model.schedule import TorqueSchedule, uniform_schedule, concatenate_schedules, round_up
 from wholearm_jax.optimisation.coupled_phases import (
     SHORTEST,
     TORQUE_SHARE,
-    Group,
-    Wanted,
+    CoupledPhases,
+    OptimiseOptions,
     descent_method,
-    optimise_group,
+    solve_coupled_phases,
     stacked_tables,
 )
-from wholearm_jax.optimisation.initial_guess import guesses
-from wholearm_jax.optimisation.interior_point import advance, begin
+from wholearm_jax.optimisation.initial_guess import initial_guesses
+from wholearm_jax.optimisation.interior_point import init_solver, take_step
 from wholearm_jax.optimisation.linearisation import Limits
-from wholearm_jax.optimisation.multiple_shooting import Variables, further
-from wholearm_jax.optimisation.rest_transition import Handover, handovers, steady
-from wholearm_jax.optimisation.solver import HOW, Step
-from wholearm_jax.phases.phase import Traced, balance_at_start, run_blank
-from wholearm_jax.phases.plan import outcomes, trace
-from wholearm_jax.phases.result import Result, describe
-from wholearm_jax.simulation.integrator import Integration, with_room
+from wholearm_jax.optimisation.multiple_shooting import Variables, extra_parts
+from wholearm_jax.optimisation.rest_transition import RestTransition, rest_transitions, holding_schedule
+from wholearm_jax.optimisation.solver import INTERVAL_OPTIONS, IterationRecord
+from wholearm_jax.phases.phase import TracedPhase, statics_at_start, precompile_simulation
+from wholearm_jax.phases.plan import simulate_phases, trace
+from wholearm_jax.phases.result import Result, build_result
+from wholearm_jax.simulation.integrator import IntegratorOptions, with_step_capacity
 from wholearm_jax.tracing.path import Resolution
 
-LEADS = (0.25, 0.1)  # shares of a phase for which its object may wait before it sets out, where rates are limited
-PASSING = 0.2  # least speed with which a phase is entered that does not begin at rest, over its mean speed
+MAX_DWELLS = (0.25, 0.1)  # shares of a phase for which its object may wait before it sets out, where rates are limited
+MIN_TRANSITION_SPEED = 0.2  # least speed with which a phase is entered that does not begin at rest, over its mean speed
 
 
 @dataclass(frozen=True)
-class Optimised:
+class OptimisationResult:
     """An optimised plan: the simulated `result`, for each phase its `bound` [N] and why the descent stopped.
 
     `scene` carries the durations that were found. `history` holds every step.
     """
 
     scene: Scene
-    torque: Torque
+    torque: TorqueSchedule
     result: Result
-    bounds: tuple[Bound, ...]
+    bounds: tuple[MarginBound, ...]
     stopped: tuple[str, ...]
-    history: tuple[Step, ...]
+    history: tuple[IterationRecord, ...]
 
     @property
     def reached(self) -> tuple[float, ...]:
@@ -73,10 +73,10 @@ class Optimised:
         return tuple(p.margin / float(b.value) if float(b.value) > 0 else float("nan") for p, b in pairs)
 
 
-def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = ()) -> Torque:
+def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[TracedPhase, ...] = ()) -> TorqueSchedule:
     """The quasi-static torques: at each knot the best squeeze for an even rest-to-rest motion, in closed form.
 
-    The motion's speed is `v ~ u^p (1 - u)^q` in `u = t / duration`: the even `p = q = 1` unless another of `PROFILES`
+    The motion's speed is `v ~ u^p (1 - u)^q` in `u = t / duration`: the even `p = q = 1` unless another of `SPEED_PROFILES`
     allows a larger margin. As the inverse dynamics at the knots only, the schedule carries the object near the wire's
     end, not exactly to it. A phase that holds the object gets its best torque.
 
@@ -90,18 +90,18 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[Traced, ...] = (
 
     def torques(at, phase):
         if phase.arrive == "hold":
-            return steady(scene, phase, at, knots)
-        start = guesses([at.table], [float(phase.duration)], knots, 1.0)[0]
-        return evenly(float(phase.duration), at.table.torque_limit * start.torque[0])
+            return holding_schedule(scene, phase, at, knots)
+        start = initial_guesses([at.table], [float(phase.duration)], knots, 1.0)[0]
+        return uniform_schedule(float(phase.duration), at.table.torque_limit * start.torque[0])
 
-    return in_turn([torques(*pair) for pair in zip(traced, scene.phases, strict=True)])
+    return concatenate_schedules([torques(*pair) for pair in zip(traced, scene.phases, strict=True)])
 
 
-def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...]:
-    """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.bound`), or
+def bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[MarginBound, ...]:
+    """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.margin_upper_bound`), or
     that of the statics for a phase that holds the object; `-inf` for a wire that could not be traced.
 
-    Derivation, section 8: a tuple of `Bound`, one a phase, with `value` [N], and `s` and `share` of the wire where
+    Derivation, section 8: a tuple of `MarginBound`, one a phase, with `value` [N], and `s` and `share` of the wire where
     it is tight.
 
     >>> [f"{float(bound.value):.3f} N" for bound in wa.bounds(wa.load("heptagon"))]
@@ -113,12 +113,12 @@ def bounds(scene: Scene, *, traced: tuple[Traced, ...] = ()) -> tuple[Bound, ...
 
     def top(at, phase, begin):
         if int(at.table.status) != Status.OK:
-            return Bound(jnp.asarray(-np.inf), at.table.breaks[0], jnp.zeros(()))
+            return MarginBound(jnp.asarray(-np.inf), at.table.breaks[0], jnp.zeros(()))
         if phase.arrive != "hold":
-            told = array(begin), array(phase.arrive == "rest"), _rolling(phase)
+            told = as_device_array(begin), as_device_array(phase.arrive == "rest"), _rolling(phase)
             return _bound(at.table, phase.duration, *told)
-        balance, departure = balance_at_start(scene, phase, at)
-        return Bound(jnp.asarray(balance.best(departure).margin), at.table.breaks[0], jnp.zeros(()))
+        balance, departure = statics_at_start(scene, phase, at)
+        return MarginBound(jnp.asarray(balance.best(departure).margin), at.table.breaks[0], jnp.zeros(()))
 
     return tuple(top(*row) for row in rows)
 
@@ -130,19 +130,19 @@ def optimise(
     steps: int = 160,
     rate_limit: float | None = None,
     durations: tuple[float, float] | None = None,
-    passing: float = PASSING,
+    passing: float = MIN_TRANSITION_SPEED,
     optimiser: optax.GradientTransformation | None = None,
     tolerance: float = 1e-3,
-    callback: Callable[[Step], None] | None = None,
-    traced: tuple[Traced, ...] = (),
-) -> Optimised:
+    callback: Callable[[IterationRecord], None] | None = None,
+    traced: tuple[TracedPhase, ...] = (),
+) -> OptimisationResult:
     """Find the torque schedule with the largest compressive margin by gradient descent through the simulation.
 
     Each phase must arrive at its planned end in time, `moving` where the next takes over and else at rest, also where
     the plan would allow any speed (`caught`, and a last phase that is `moving`); `knots` torques a joint and phase,
     evenly spaced over the time for which it moves, are linear in between. The scene's torque limits hold, and
     `rate_limit` [N m/s] if given: then torques do not step where phases change either, and an object may wait, held by
-    friction, for up to a quarter of a phase until the torque sets it out (`handover`). `durations = (shortest,
+    friction, for up to a quarter of a phase until the torque sets it out (`rest_transition`). `durations = (shortest,
     longest)` lets each phase choose its own. Formations that take over at speed are entered with at least `passing`
     times their phase's mean speed (wire over duration): an object that hardly moves where its formation changes may as
     well stop short of it. `optimiser` replaces the interior point by any optax optimiser (`descent.projected`). A phase
@@ -166,18 +166,18 @@ def optimise(
         raise ValueError("durations are (shortest, longest), positive and in this order")
     if durations is not None and durations[0] == durations[1]:
         scene, durations = _lasting(scene, durations[0]), None
-    compiled = optimise_beside(scene, knots=knots, optimiser=optimiser)
+    compiled = precompile_optimise(scene, knots=knots, optimiser=optimiser)
     traced = traced or trace(scene)
     if any(int(at.table.status) == Status.OK for at in traced):
-        wait(*compiled)
+        wait_for(*compiled)
     # A bound covers speeds as multiples of a length a duration: of the shortest that a phase may choose.
     least = scene if durations is None else _lasting(scene, max(durations[0], SHORTEST * durations[1]))
     tops = bounds(least, traced=traced)
     rows = _rows(scene, knots)
     told = callback and _in_turn_called(callback)
-    wanted = Wanted(knots, rows, steps, rate_limit, durations, passing, optimiser, tolerance, told)
+    wanted = OptimiseOptions(knots, rows, steps, rate_limit, durations, passing, optimiser, tolerance, told)
     found = []
-    for lead in LEADS if rate_limit is not None else LEADS[:1]:
+    for lead in MAX_DWELLS if rate_limit is not None else MAX_DWELLS[:1]:
         found.append(_attempt(scene, traced, tops, wanted, lead))
         if found[-1].result.status is Status.OK:
             return found[-1]
@@ -190,12 +190,12 @@ def require_knots(knots: int) -> None:
         raise ValueError(f"knots must be at least 2, not {knots}")
 
 
-def _attempt(scene: Scene, traced, tops, wanted: Wanted, lead: float) -> Optimised:
+def _attempt(scene: Scene, traced, tops, wanted: OptimiseOptions, lead: float) -> OptimisationResult:
     """All groups of phases side by side, objects waiting at most a share `lead` of a phase before they set out."""
     groups = _groups(scene)
-    changes: list[Handover | None] = [None] * (len(groups) - 1)
+    changes: list[RestTransition | None] = [None] * (len(groups) - 1)
     if wanted.rate_limit is not None:
-        changes = handovers(scene, groups, traced, tops, wanted.rate_limit, lead, wanted.durations)
+        changes = rest_transitions(scene, groups, traced, tops, wanted.rate_limit, lead, wanted.durations)
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         one = partial(_part, scene, traced, tops, wanted)
         parts = list(threads.map(one, groups, itertools.pairwise([None, *changes, None])))
@@ -205,28 +205,28 @@ def _attempt(scene: Scene, traced, tops, wanted: Wanted, lead: float) -> Optimis
     lengths = [float(np.asarray(f.times)[-1]) for f in found]
     phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, lengths, strict=True))
     scene = eqx.tree_at(lambda s: s.phases, scene, phases)
-    torque = in_turn(found)
-    result = describe(scene, torque, traced, outcomes(scene, torque, traced, with_room(Integration(), wanted.knots)))
-    return Optimised(scene, torque, result, tops, tuple(stopped), tuple(history))
+    torque = concatenate_schedules(found)
+    result = build_result(scene, torque, traced, simulate_phases(scene, torque, traced, with_step_capacity(IntegratorOptions(), wanted.knots)))
+    return OptimisationResult(scene, torque, result, tops, tuple(stopped), tuple(history))
 
 
 def _part(
-    scene: Scene, traced, tops, wanted: Wanted, group: list[int], ends: tuple[Handover | None, Handover | None]
-) -> tuple[list[Torque], str, list[Step]]:
+    scene: Scene, traced, tops, wanted: OptimiseOptions, group: list[int], ends: tuple[RestTransition | None, RestTransition | None]
+) -> tuple[list[TorqueSchedule], str, list[IterationRecord]]:
     """One group of phases, given how it takes over and hands over: schedules, why their descent stopped, its steps."""
     phases, (begin, end) = tuple(scene.phases[k] for k in group), ends
     if phases[0].arrive == "hold":
-        held = steady(scene, phases[0], traced[group[0]], wanted.knots, wanted.rate_limit, begin, end)
+        held = holding_schedule(scene, phases[0], traced[group[0]], wanted.knots, wanted.rate_limit, begin, end)
         return [held], "the best torque of a linear programme", []
     wires, most = [traced[k] for k in group], [tops[k] for k in group]
-    return optimise_group(scene, Group(group[0], phases, wires, most, begin, end, wanted))
+    return solve_coupled_phases(scene, CoupledPhases(group[0], phases, wires, most, begin, end, wanted))
 
 
-def _in_turn_called(callback: Callable[[Step], None]) -> Callable[[Step], None]:
+def _in_turn_called(callback: Callable[[IterationRecord], None]) -> Callable[[IterationRecord], None]:
     """The same, called by one thread at a time."""
     turn = threading.Lock()
 
-    def call(step: Step) -> None:
+    def call(step: IterationRecord) -> None:
         with turn:
             callback(step)
 
@@ -239,20 +239,20 @@ def _lasting(scene: Scene, duration: float) -> Scene:
     return eqx.tree_at(lambda s: s.phases, scene, tuple(phases))
 
 
-def optimise_beside(
+def precompile_optimise(
     scene: Scene, *, knots: int = 51, optimiser: optax.GradientTransformation | None = None
-) -> tuple[Beside, ...]:
+) -> tuple[BackgroundCall, ...]:
     """Compile what `optimise` runs in a thread of its own, while wires are traced; it is to be waited for."""
     sizes = sorted({len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"})
     rolling = sorted({_rolling(p) for p in scene.phases if p.arrive != "hold"})
-    squeezes = beside(_squeeze_blank, tuple(sizes), tuple(rolling), knots)
-    descents = [beside(_advance_blank, n, knots, optimiser) for n in sizes]
-    return squeezes, *descents, beside(run_blank, _rows(scene, knots), with_room(Integration(), knots))
+    squeezes = call_in_background(_squeeze_blank, tuple(sizes), tuple(rolling), knots)
+    descents = [call_in_background(_advance_blank, n, knots, optimiser) for n in sizes]
+    return squeezes, *descents, call_in_background(precompile_simulation, _rows(scene, knots), with_step_capacity(IntegratorOptions(), knots))
 
 
 def _rows(scene: Scene, knots: int) -> int:
     """Room for the whole plan's schedule, and for what stands before its phases where rates are limited."""
-    return rounded((knots + 1) * len(scene.phases))
+    return round_up((knots + 1) * len(scene.phases))
 
 
 def _groups(scene: Scene) -> list[list[int]]:
@@ -271,23 +271,23 @@ def _rolling(phase: Phase) -> int:
 
 def _squeeze_blank(sizes: tuple[int, ...], rolling: tuple[int, ...], knots: int) -> None:
     """Make the bounds and starts of groups of such sizes on tables that have no wire."""
-    table, one = blank(Resolution()), array(1.0)
+    table, one = placeholder_dynamics(Resolution()), as_device_array(1.0)
     for count in rolling:
-        _bound(table, one, array(True), array(True), count)
+        _bound(table, one, as_device_array(True), as_device_array(True), count)
     for phases in sizes:
-        guesses([table] * phases, np.ones(phases), knots, TORQUE_SHARE)
+        initial_guesses([table] * phases, np.ones(phases), knots, TORQUE_SHARE)
 
 
 def _advance_blank(phases: int, knots: int, optimiser: optax.GradientTransformation | None) -> None:
     """Take one step of a descent on tables that have no wire."""
-    tables = stacked_tables([blank(Resolution())] * phases)
-    method = descent_method(optimiser, phases, further(tables))
+    tables = stacked_tables([placeholder_dynamics(Resolution())] * phases)
+    method = descent_method(optimiser, phases, extra_parts(tables))
     each = np.ones(phases)
     plain = (np.full(2, np.inf), each, each, np.zeros(()), np.zeros((phases, knots), bool), each)
-    limits = Limits(*(array(a) for a in plain))
+    limits = Limits(*(as_device_array(a) for a in plain))
     empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
-    p = Variables(*(array(a) for a in empty))
-    advance(begin(p, method), tables, limits, HOW, method)
+    p = Variables(*(as_device_array(a) for a in empty))
+    take_step(init_solver(p, method), tables, limits, INTERVAL_OPTIONS, method)
 
 
-_bound = Program(bound)
+_bound = Program(margin_upper_bound)

@@ -22,20 +22,20 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core.arrays import array
+from wholearm_jax.core.arrays import as_device_array
 from wholearm_jax.core.programs import Program
 from wholearm_jax.core.status import Status
-from wholearm_jax.dynamics.path_dynamics import Table
-from wholearm_jax.margin.contact_forces import linear_slacks
-from wholearm_jax.margin.quasistatic import Bound, coefficients
-from wholearm_jax.margin.statics import CLOSE, EXACT, Departure, Statics
+from wholearm_jax.dynamics.path_dynamics import PathDynamics
+from wholearm_jax.margin.contact_forces import cone_facets
+from wholearm_jax.margin.quasistatic import MarginBound, affine_coefficients
+from wholearm_jax.margin.statics import MARGIN_TIE, SOLVER_TOL, RestAccelerations, Statics
 from wholearm_jax.model.scene import Phase, Scene
-from wholearm_jax.model.schedule import Torque, evenly
-from wholearm_jax.phases.phase import Traced, balance_at_start
+from wholearm_jax.model.schedule import TorqueSchedule, uniform_schedule
+from wholearm_jax.phases.phase import TracedPhase, statics_at_start
 
-BRISK = 1.0  # least acceleration with which an object arrives, or sets out at once [wire lengths a duration squared]
-FAST = 2.0  # change of speed within which the largest such acceleration is reached [wire lengths a duration]
-SURE = 0.01  # how far from the torques that would move it an object rests, as a share of their limits
+MIN_ACCELERATION = 1.0  # least acceleration with which an object arrives, or sets out at once [wire lengths a duration squared]
+MIN_SPEED_CHANGE = 2.0  # change of speed within which the largest such acceleration is reached [wire lengths a duration]
+MIN_REST_MARGIN = 0.01  # how far from the torques that would move it an object rests, as a share of their limits
 TAU, SIGMA, WAY, LEVEL, KNOWN = slice(0, 2), slice(2, 4), 4, 5, 6  # a programme's variables: the torques in units of
 # their limits, the larger of the ways from one to the other, m, and then the forces of statics
 
@@ -43,7 +43,7 @@ TAU, SIGMA, WAY, LEVEL, KNOWN = slice(0, 2), slice(2, 4), 4, 5, 6  # a programme
 class Moving(NamedTuple):
     """A phase that moves its object: its table, duration [s], and the bound of its margin [N]."""
 
-    table: Table
+    table: PathDynamics
     duration: float
     bound: float
 
@@ -52,18 +52,18 @@ class Resting(NamedTuple):
     """An object at rest in a formation: statics, accelerations, and the bound of its margin [N]."""
 
     balance: Statics
-    departure: Departure
+    departure: RestAccelerations
     bound: float
 
 
-class Near(NamedTuple):
+class ReachableTorque(NamedTuple):
     """The `torque` [N m] with which what stands before a change began, and how far it may have gone since (`way`)."""
 
     torque: Float[np.ndarray, "2"]
     way: float
 
 
-class Handover(NamedTuple):
+class RestTransition(NamedTuple):
     """The `torque` [N m] at a change and the one with which the object sets out (`begin`), `lead` [s] later; `share`
     is the least margin at both over its bound, `-inf` where no torques can serve."""
 
@@ -78,15 +78,15 @@ class Handover(NamedTuple):
         return self.share > 0
 
 
-def handovers(
+def rest_transitions(
     scene: Scene,
     groups: list[list[int]],
-    traced: tuple[Traced, ...],
-    tops: tuple[Bound, ...],
+    traced: tuple[TracedPhase, ...],
+    tops: tuple[MarginBound, ...],
     rate_limit: float,
     lead: float,
     durations: tuple[float, float] | None,
-) -> list[Handover | None]:
+) -> list[RestTransition | None]:
     """The torques between each group of a plan's phases and the next; None where there is nothing to hand over.
 
     Phases of a group follow one another at speed. `tops` are the phases' bounds; an object waits for at most a share
@@ -102,13 +102,13 @@ def handovers(
         return Moving(traced[k].table, lasts(k), float(tops[k].value))
 
     def resting(k):
-        return Resting(*balance_at_start(scene, scene.phases[k], traced[k]), float(tops[k].value))
+        return Resting(*statics_at_start(scene, scene.phases[k], traced[k]), float(tops[k].value))
 
     def near(group, begin):
         if begin is None or not begin.serves:
             return None
         time = sum(lasts(k) for k in group) - begin.lead
-        return Near(begin.begin, rate_limit * time)
+        return ReachableTorque(begin.begin, rate_limit * time)
 
     def between(group, following, begin):
         k, onward = group[-1], following[0]
@@ -116,23 +116,23 @@ def handovers(
             return None
         before = resting(k) if scene.phases[k].arrive == "hold" else moving(k)
         after = None if scene.phases[onward].arrive == "hold" else moving(onward)
-        return handover(before, resting(onward), after, rate_limit, lead, near(group, begin))
+        return rest_transition(before, resting(onward), after, rate_limit, lead, near(group, begin))
 
-    found: list[Handover | None] = []
+    found: list[RestTransition | None] = []
     for group, following in itertools.pairwise(groups):
         found.append(between(group, following, found[-1] if found else None))
     return found
 
 
-def steady(
+def holding_schedule(
     scene: Scene,
     phase: Phase,
-    at: Traced,
+    at: TracedPhase,
     knots: int,
     rate_limit: float | None = None,
-    begin: Handover | None = None,
-    end: Handover | None = None,
-) -> Torque:
+    begin: RestTransition | None = None,
+    end: RestTransition | None = None,
+) -> TorqueSchedule:
     """The best torque to hold an object, from time 0; at a limited rate as near to it as there is time for, straight
     from the torque where the hold begins and straight to that where it ends.
 
@@ -140,11 +140,11 @@ def steady(
     """
     duration, known = float(phase.duration), int(at.table.status) == Status.OK
     if not known:
-        return evenly(duration, np.zeros((knots, 2)))
-    balance, departure = balance_at_start(scene, phase, at)
+        return uniform_schedule(duration, np.zeros((knots, 2)))
+    balance, departure = statics_at_start(scene, phase, at)
     best = balance.steadiest(departure).torque
     if rate_limit is None:
-        return evenly(duration, np.tile(best, (knots, 1)))
+        return uniform_schedule(duration, np.tile(best, (knots, 1)))
     first, last = (one.torque if one is not None and one.serves else best for one in (begin, end))
 
     def by(share):
@@ -163,17 +163,17 @@ def steady(
     via, there, back = by(share)
     times = np.array([0.0, min(there, duration), max(duration - back, there), duration])
     last_of_each = np.append(np.diff(times) > 0, True)
-    return Torque(array(times[last_of_each]), array(np.stack([first, via, via, last])[last_of_each]))
+    return TorqueSchedule(as_device_array(times[last_of_each]), as_device_array(np.stack([first, via, via, last])[last_of_each]))
 
 
-def handover(
+def rest_transition(
     before: Moving | Resting,
     after: Resting,
     onward: Moving | None,
     rate_limit: float,
     lead: float,
-    near: Near | None = None,
-) -> Handover:
+    near: ReachableTorque | None = None,
+) -> RestTransition:
     """The best torques where one phase gives way to another at rest.
 
     `after` is the rest with which the next phase begins, and `onward` its motion, or None if it only holds the object.
@@ -189,7 +189,7 @@ def handover(
     now, soon = _setting_out(onward, limit, rate_limit)
     at_once = _solved([*common, *now], limit, rate_limit, 0.0)
     later = _solved([*common, _staying(after), *soon], limit, rate_limit, lead * onward.duration)
-    return at_once if at_once.share >= CLOSE * later.share else later
+    return at_once if at_once.share >= MARGIN_TIE * later.share else later
 
 
 class _Conditions(NamedTuple):
@@ -201,7 +201,7 @@ class _Conditions(NamedTuple):
     equal_0: Float[np.ndarray, "equalities"]
 
 
-def _within_reach(near: Near, limit) -> _Conditions:
+def _within_reach(near: ReachableTorque, limit) -> _Conditions:
     above = np.zeros((4, KNOWN))
     above[:2, TAU], above[2:, TAU] = np.eye(2), -np.eye(2)
     there = near.torque / limit
@@ -231,10 +231,10 @@ def _setting_out(phase: Moving, limit, rate_limit: float) -> tuple[list[_Conditi
 
 def _range(phase: Moving, motion, rate_limit: float) -> tuple[float, float]:
     """Accelerations with which an object may arrive or set out: the largest is reached at the limited rate while the
-    object's speed changes by `FAST`."""
+    object's speed changes by `MIN_SPEED_CHANGE`."""
     length, pull = float(phase.table.length), float(np.abs(motion[3:]).sum())
-    least = BRISK * length / phase.duration**2
-    return least, max(2 * least, float(np.sqrt(2 * FAST * length / phase.duration * pull * rate_limit)))
+    least = MIN_ACCELERATION * length / phase.duration**2
+    return least, max(2 * least, float(np.sqrt(2 * MIN_SPEED_CHANGE * length / phase.duration * pull * rate_limit)))
 
 
 def _bearing(forces, limit, where: slice = TAU) -> _Conditions:
@@ -271,14 +271,14 @@ def _staying(rest: Resting) -> _Conditions:
     above[:-2, KNOWN:] = forces
     above[:count, LEVEL] = -rest.bound / balance.unit
     above[-2:, TAU] = still[:, 1:]
-    above_0 = np.concatenate([np.zeros(3 * count), balance.dry, balance.dry, still[:, 0] - SURE])
+    above_0 = np.concatenate([np.zeros(3 * count), balance.dry, balance.dry, still[:, 0] - MIN_REST_MARGIN])
     equal = np.zeros((5, above.shape[1]))
     equal[:, TAU] = balance.load[:, 1:] * limit
     equal[:, KNOWN:] = balance.wrench
     return _Conditions(above, above_0, equal, balance.load[:, 0])
 
 
-def _solved(conditions: list[_Conditions], limit, rate_limit: float, longest: float) -> Handover:
+def _solved(conditions: list[_Conditions], limit, rate_limit: float, longest: float) -> RestTransition:
     """The programme with all conditions together."""
     from scipy.optimize import linprog  # takes half a second to import
 
@@ -304,25 +304,25 @@ def _solved(conditions: list[_Conditions], limit, rate_limit: float, longest: fl
 
     def best(price, level):
         bounds = [*within, level, *[(None, None)] * sum(sizes)]
-        kind = {"A_ub": -above, "b_ub": above_0, "A_eq": equal, "b_eq": -equal_0, "options": EXACT}
+        kind = {"A_ub": -above, "b_ub": above_0, "A_eq": equal, "b_eq": -equal_0, "options": SOLVER_TOL}
         return linprog(price, bounds=bounds, **kind)
 
     largest = best(-np.eye(begins[-1])[LEVEL], (0.0, 1.0))
     if largest.status != 0:
-        return Handover(np.zeros(2), np.zeros(2), 0.0, -np.inf)
-    found = best(np.eye(begins[-1])[WAY], (CLOSE * largest.x[LEVEL], 1.0))
+        return RestTransition(np.zeros(2), np.zeros(2), 0.0, -np.inf)
+    found = best(np.eye(begins[-1])[WAY], (MARGIN_TIE * largest.x[LEVEL], 1.0))
     x = found.x if found.status == 0 else largest.x
     tau, sigma = limit * x[TAU], limit * x[SIGMA]
     lead = float(np.abs(sigma - tau).max()) / rate_limit if longest > 0 else 0.0
-    return Handover(tau, sigma if longest > 0 else tau, lead, float(x[LEVEL]))
+    return RestTransition(tau, sigma if longest > 0 else tau, lead, float(x[LEVEL]))
 
 
-def _terms_at(table: Table, end: int):
+def _terms_at(table: PathDynamics, end: int):
     return jax.device_get(_terms(table, table.breaks[end]))
 
 
 @Program
-def _terms(table: Table, s) -> tuple[Float[Array, "5"], Float[Array, "slacks 5"]]:
+def _terms(table: PathDynamics, s) -> tuple[Float[Array, "5"], Float[Array, "slacks 5"]]:
     """Coefficients of the acceleration and of the slacks at a place of a wire."""
-    motion, forces = coefficients(table, s)
-    return motion, linear_slacks(table, forces)
+    motion, forces = affine_coefficients(table, s)
+    return motion, cone_facets(table, forces)

@@ -21,15 +21,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core.small_linalg import times
-from wholearm_jax.optimisation.linearisation import Linear, blocks, columns, gather, of_states, sizes
+from wholearm_jax.core.small_linalg import fused_matmul
+from wholearm_jax.optimisation.linearisation import LinearisedProblem, gauss_newton_blocks, columns, jacobian_transpose_product, of_states, sizes
 
 SPREAD = 1e-8  # price of the square of any change: what no room depends on stays where it is
 
 
-class Quadratic(NamedTuple):
+class ParametricLQ(NamedTuple):
     """`p^T (H + diag(price)) p / 2 - pull.p - m lean.p + weight m^2 / 2 - rise m` in the variables `p` and the margin's
-    level `m`; `H` is made of the `blocks` of the intervals."""
+    level `m`; `H` is made of the `gauss_newton_blocks` of the intervals."""
 
     blocks: Float[Array, "phases intervals 7 7"]
     price: Float[Array, "p"]
@@ -39,11 +39,11 @@ class Quadratic(NamedTuple):
     rise: Float[Array, ""]
 
 
-class _Order(NamedTuple):
+class _StageLayout(NamedTuple):
     """The numbers of a stage: state and torques at its knot, the shared numbers (`level`, `durations`, `goals` and
     `one`), torques at the next knot from `size` on.
 
-    `local` says which of an interval's seven numbers each is (7: none), `own` which variable of `p` counts in this
+    `interval_inputs` says which of an interval's seven numbers each is (7: none), `own` which variable of `p` counts in this
     stage and no other (the last: none). `ends` marks the goals of places and speeds in the stages that meet them, `v`
     are the last speeds of phases that hand over, `lost` and `steps` their equations.
     """
@@ -61,7 +61,7 @@ class _Order(NamedTuple):
 
 
 @functools.cache
-def _order(phases: int, knots: int) -> _Order:
+def _stage_layout(phases: int, knots: int) -> _StageLayout:
     """The same for all problems of a size."""
     intervals, each = knots - 1, np.arange(phases)
     level, durations, one = 4, slice(5, 5 + phases), 6 + 2 * phases
@@ -78,10 +78,10 @@ def _order(phases: int, knots: int) -> _Order:
     ends[each, -1, 0, each] = ends[-1, -1, 1, -1] = 1.0
     joins = phases * intervals * 2
     v, lost = knot.size + knot[:-1, -1, 1], joins + np.arange(phases - 1)
-    return _Order(level, durations, one, size, local, own, ends, v, lost, slice(joins + phases - 1, None))
+    return _StageLayout(level, durations, one, size, local, own, ends, v, lost, slice(joins + phases - 1, None))
 
 
-class _Stages(NamedTuple):
+class _LQStages(NamedTuple):
     """Second derivatives of what each stage costs, and how it leads to the state and the torques at the next knot;
     `ends` are the rows of a state before it is handed over, or must be what it is planned to be."""
 
@@ -90,7 +90,7 @@ class _Stages(NamedTuple):
     ends: Float[Array, "phases intervals 2 numbers"]
 
 
-def newton_step(linear: Linear, stiff, aim, damping) -> tuple[Float[Array, "p"], Float[Array, ""], Float[Array, "e"]]:
+def kkt_step(linear: LinearisedProblem, stiff, aim, damping) -> tuple[Float[Array, "p"], Float[Array, ""], Float[Array, "e"]]:
     """The steps of `p` and of the margin's level `m`, and the prices `y` of the equations that `p` must keep:
 
         (J^T S J + damping) p - J^T S b m + E^T y = J^T aim
@@ -103,36 +103,36 @@ def newton_step(linear: Linear, stiff, aim, damping) -> tuple[Float[Array, "p"],
     lean = stiff * bears
     price = jnp.full(linear.still.shape, SPREAD) + damping
     rise = 1 - (bears * aim).sum()
-    pulls = gather(linear, aim), gather(linear, lean)
-    return least(linear, Quadratic(blocks(linear, stiff), price, *pulls, lean.sum(), rise))
+    pulls = jacobian_transpose_product(linear, aim), jacobian_transpose_product(linear, lean)
+    return solve_lq(linear, ParametricLQ(gauss_newton_blocks(linear, stiff), price, *pulls, lean.sum(), rise))
 
 
-def nearest(linear: Linear, wanted: Float[Array, "p"]) -> Float[Array, "p"]:
+def project_step(linear: LinearisedProblem, wanted: Float[Array, "p"]) -> Float[Array, "p"]:
     """The step that joins the intervals with changes of torques and durations nearest to those `wanted`. Where states
     are wanted, too, these pull: the gradient of a loss becomes that with respect to torques and durations alone."""
     price = jnp.ones(linear.still.shape).at[of_states(linear)].set(0.0)
     none, zero = jnp.zeros((*columns(linear).shape, 7)), jnp.zeros(())
     wanted = jnp.where(linear.still, 0.0, wanted)
-    return least(linear, Quadratic(none, price, wanted, jnp.zeros_like(wanted), zero + 1, zero))[0]
+    return solve_lq(linear, ParametricLQ(none, price, wanted, jnp.zeros_like(wanted), zero + 1, zero))[0]
 
 
-def least(linear: Linear, quadratic: Quadratic) -> tuple[Float[Array, "p"], Float[Array, ""], Float[Array, "e"]]:
+def solve_lq(linear: LinearisedProblem, quadratic: ParametricLQ) -> tuple[Float[Array, "p"], Float[Array, ""], Float[Array, "e"]]:
     """Where a quadratic function is least under `E p = -defect`: `p`, the level, and the prices of the equations."""
-    at, stages = _order(*sizes(linear)), _stages(linear, quadratic)
-    value, gain, rate = _back(at, stages, quadratic)
+    at, stages = _stage_layout(*sizes(linear)), _stages(linear, quadratic)
+    value, gain, rate = _backward_pass(at, stages, quadratic)
     # At the first knot the state is given, the torques are not.
     free = slice(2, at.one)
     torque, shared = jnp.split(jnp.linalg.solve(value[free, free], -value[free, at.one]), [2])
     shared = jnp.append(shared, 1.0)
-    here, there = _forth(at, stages, gain, torque, shared)
+    here, there = _forward_pass(at, stages, gain, torque, shared)
     chosen = -jnp.einsum("kij,kj->ki", gain, here)
     numbers = jnp.concatenate([here, chosen], axis=1).reshape(stages.cost.shape[:3])
     rates = jnp.einsum("kij,kj->ki", rate, there).reshape(*numbers.shape[:2], 4)
     last = jnp.einsum("pij,pj->pi", stages.ends[:, -1], numbers[:, -1])
-    return _together(linear, numbers, last, shared), shared[0], _prices(linear, quadratic, rates, last, shared)
+    return _together(linear, numbers, last, shared), shared[0], _multipliers(linear, quadratic, rates, last, shared)
 
 
-def _back(at: _Order, stages: _Stages, quadratic: Quadratic):
+def _backward_pass(at: _StageLayout, stages: _LQStages, quadratic: ParametricLQ):
     """From the last knot to the first: second derivatives of `V` at the first; for each stage, how the torques at the
     next knot follow (`-gain`), and the first four rows of the second derivatives of `V` there."""
     size, level, one = at.size, at.level, at.one
@@ -143,7 +143,7 @@ def _back(at: _Order, stages: _Stages, quadratic: Quadratic):
     def back(value, stage):
         cost, onward = stage
         onward = jnp.concatenate([onward, kept])
-        whole = times(onward.T, times(value, onward)) + cost  # sums of products: the loop is compiled whole
+        whole = fused_matmul(onward.T, fused_matmul(value, onward)) + cost  # sums of products: the loop is compiled whole
         (a, b), (_, c) = whole[size:, size:]
         first, second = whole[size:, :size]
         gain = jnp.stack([c * first - b * second, a * second - b * first]) / (a * c - b * b)
@@ -153,14 +153,14 @@ def _back(at: _Order, stages: _Stages, quadratic: Quadratic):
     return value, gain, rate
 
 
-def _forth(at: _Order, stages: _Stages, gain, torque, shared):
+def _forward_pass(at: _StageLayout, stages: _LQStages, gain, torque, shared):
     """From the first knot to the last: all numbers of each stage but the torques at its next knot, and of the next."""
     onward = _in_turn(stages.onward)
     led = onward[:, :, : at.size] - onward[:, :, at.size :] @ gain
     steady = led[:, :, at.level :] @ shared
     begin = jnp.concatenate([jnp.zeros(2), torque])
     end, knots = jax.lax.scan(
-        lambda x, stage: (times(stage[0], x) + stage[1], x), begin, (led[:, :, : at.level], steady)
+        lambda x, stage: (fused_matmul(stage[0], x) + stage[1], x), begin, (led[:, :, : at.level], steady)
     )
     each = jnp.broadcast_to(shared, (knots.shape[0], shared.size))
     return [jnp.concatenate([x, each], axis=1) for x in (knots, jnp.concatenate([knots[1:], end[None]]))]
@@ -171,10 +171,10 @@ def _in_turn(stages):
     return stages.reshape(-1, *stages.shape[2:])
 
 
-def _stages(linear: Linear, quadratic: Quadratic) -> _Stages:
+def _stages(linear: LinearisedProblem, quadratic: ParametricLQ) -> _LQStages:
     """The stages of a quadratic function; what stays has no part in them."""
     phases, knots = sizes(linear)
-    at, stage = _order(phases, knots), (phases, knots - 1)
+    at, stage = _stage_layout(phases, knots), (phases, knots - 1)
     moves = jnp.where(linear.still, 0.0, 1.0)[columns(linear)]
     ends = _placed(at, linear.rates.end * moves[..., None, :], -1)
     ends = ends.at[..., at.one].add(linear.defect[: 2 * phases * (knots - 1)].reshape(*stage, 2))
@@ -182,18 +182,18 @@ def _stages(linear: Linear, quadratic: Quadratic) -> _Stages:
     onward = jnp.concatenate([ends, torques], axis=2).at[:, -1, :2].set(0.0)
     bends = _placed(at, _placed(at, quadratic.blocks * moves[..., None] * moves[..., None, :], -1), -2)
     price = _own(at, quadratic.price)[..., None] * np.eye(at.size + 2)
-    stages = _Stages(bends + price + _mirrored(_beside(at, quadratic, ends)), onward, ends)
+    stages = _LQStages(bends + price + _mirrored(_beside(at, quadratic, ends)), onward, ends)
     return stages if phases == 1 else _handed_over(at, stages, linear, quadratic)
 
 
-def _placed(at: _Order, values, axis):
+def _placed(at: _StageLayout, values, axis):
     """Numbers of an interval's seven along an axis, among those of its stage."""
     room = [(0, 0)] * values.ndim
     room[axis] = (0, 1)
     return jnp.stack([jnp.take(v, own, axis=axis) for v, own in zip(jnp.pad(values, room), at.local, strict=True)])
 
 
-def _own(at: _Order, values):
+def _own(at: _StageLayout, values):
     """Numbers of variables, each in one stage."""
     return jnp.append(values, 0.0)[at.own]
 
@@ -202,7 +202,7 @@ def _mirrored(half):
     return half + jnp.swapaxes(half, -1, -2)
 
 
-def _beside(at: _Order, quadratic: Quadratic, ends):
+def _beside(at: _StageLayout, quadratic: ParametricLQ, ends):
     """What is linear, beside 1; what leans on the level, beside it; and what must end as planned, beside its price."""
     must = (ends[..., None] * at.ends[:, :, :, None]).sum(2)
 
@@ -214,7 +214,7 @@ def _beside(at: _Order, quadratic: Quadratic, ends):
     return jnp.concatenate([none(at.level), lean[..., None], phases, must, pull[..., None], none(2)], axis=-1)
 
 
-def _handed_over(at: _Order, stages: _Stages, linear: Linear, quadratic: Quadratic) -> _Stages:
+def _handed_over(at: _StageLayout, stages: _LQStages, linear: LinearisedProblem, quadratic: ParametricLQ) -> _LQStages:
     """The last stages of phases lead to the first knots of the next: there speeds follow and torques go on."""
     last, across = stages.ends[:-1, -1, 1], linear.across[at.lost]
     speed = -linear.across[at.lost, at.v][:, None] * last
@@ -229,9 +229,9 @@ def _handed_over(at: _Order, stages: _Stages, linear: Linear, quadratic: Quadrat
     return stages._replace(cost=stages.cost.at[:-1, -1].add(_mirrored(half)), onward=onward)
 
 
-def _together(linear: Linear, numbers, last, shared) -> Float[Array, "p"]:
+def _together(linear: LinearisedProblem, numbers, last, shared) -> Float[Array, "p"]:
     """The changes of all variables; what stays does."""
-    at = _order(*sizes(linear))
+    at = _stage_layout(*sizes(linear))
     torque = jnp.concatenate([numbers[:, :, 2:4], numbers[:, -1:, at.size :]], axis=1)
     state = jnp.concatenate([numbers[:, :, :2], last[:, None]], axis=1)
     phases = numbers.shape[0]
@@ -239,10 +239,10 @@ def _together(linear: Linear, numbers, last, shared) -> Float[Array, "p"]:
     return jnp.where(linear.still, 0.0, way)
 
 
-def _prices(linear: Linear, quadratic: Quadratic, rates, last, shared) -> Float[Array, "e"]:
+def _multipliers(linear: LinearisedProblem, quadratic: ParametricLQ, rates, last, shared) -> Float[Array, "e"]:
     """The price of each equation is how what all behind it costs grows with what it gives: `rates` at the next knot."""
     phases = rates.shape[0]
-    at, goals = _order(*sizes(linear)), shared[1 + phases : -1]
+    at, goals = _stage_layout(*sizes(linear)), shared[1 + phases : -1]
     joins = rates[:, :, :2].at[:, -1, 0].set(goals[:-1]).at[-1, -1, 1].set(goals[-1])
     lost, steps = -rates[:-1, -1, 1], -rates[:-1, -1, 2:]
     costs = quadratic.price[at.v] * last[:-1, 1] - quadratic.pull[at.v] - quadratic.lean[at.v] * shared[0]

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from wholearm_jax.dynamics.path_dynamics import Table
-from wholearm_jax.optimisation.interior_point import JOINED, advance, begin
+from wholearm_jax.dynamics.path_dynamics import PathDynamics
+from wholearm_jax.optimisation.interior_point import DEFECT_TOL, init_solver, take_step
 from wholearm_jax.optimisation.linearisation import Limits
 from wholearm_jax.optimisation.multiple_shooting import Variables
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.integrator import IntegratorOptions
 
 RISE = 0.01  # most that a step which is held back may raise the merit, as a share of the bound
 DAMPING, DAMPED = 1e-8, 1.3  # price of its size, and by how much that grows from one such step to the next
@@ -26,13 +26,13 @@ CLOSE = 1e-5  # sum of the defects from which full steps close them
 SETTLED, NEARLY = 0.05, 1e-2  # shares of the tolerance by which a margin that settled changes, sum of its defects
 CLOSING = 1e3  # price of a step's size beside which the margin counts little: the smallest step that joins intervals
 LOST = 1e-6  # share of a step at which a descent gives up
-ALIKE = (2e-3, 2e-2)  # differences of states at knots [lengths, lengths a duration] with which descents end alike
+SAME_SOLUTION_TOL = (2e-3, 2e-2)  # differences of states at knots [lengths, lengths a duration] with which descents end alike
 CONVERGED, REPEATED = "the margin no longer improves", "an earlier start led there, too"
-HOW = Integration()
+INTERVAL_OPTIONS = IntegratorOptions()
 
 
 @dataclass(frozen=True)
-class Step:
+class IterationRecord:
     """One step of the descent from one of a phase's starts: the temperature as a share of the bound, the least sampled
     force [N], how far apart the intervals still are (`shooting`), the time it took [s]."""
 
@@ -50,43 +50,43 @@ class Problem(NamedTuple):
     number; at most `steps` steps, and a `tolerance` as a share of the bound."""
 
     phase: int
-    tables: Table
+    tables: PathDynamics
     bounds: np.ndarray
     limits: Limits
     steps: int
     tolerance: float
 
 
-def descend(
+def solve(
     problem: Problem,
     start: Variables,
     number: int,
     method,
-    callback: Callable[[Step], None] | None,
+    callback: Callable[[IterationRecord], None] | None,
     ended: Sequence[Variables] = (),
-) -> tuple[Variables, str, list[Step]]:
+) -> tuple[Variables, str, list[IterationRecord]]:
     """Descend from start number `number`: the variables where it ends, why it ends, and its steps.
 
     `method` is `descent.interior_point` or `descent.projected`; `ended` is where descents from earlier starts
     ended, of which none is followed to its end again.
     """
-    d, rounds, margin_before, history = begin(start, method), 0, np.nan, []
+    d, rounds, margin_before, history = init_solver(start, method), 0, np.nan, []
     for count in range(problem.steps):
         begun = time.perf_counter()
-        after = advance(d, problem.tables, problem.limits, HOW, method)
+        after = take_step(d, problem.tables, problem.limits, INTERVAL_OPTIONS, method)
         least, apart, hot, coldest, shares, share = jax.device_get(
             (after.least, after.apart, after.state.temperature, after.state.coldest, after.state.steps, after.share)
         )
         margin, near = float((least * problem.bounds).min()), least.min() >= 1 - problem.tolerance
         spent = time.perf_counter() - begun
-        history.append(Step(problem.phase, number, count, float(hot), margin, float(apart), spent))
+        history.append(IterationRecord(problem.phase, number, count, float(hot), margin, float(apart), spent))
         if callback is not None:
             callback(history[-1])
-        if apart < JOINED and hot <= coldest and (shares.min() >= 1 or near):
+        if apart < DEFECT_TOL and hot <= coldest and (shares.min() >= 1 or near):
             return d.p, CONVERGED, history
         if share < LOST:
             return d.p, "no step leads on", history
-        if apart < NEARLY and any(_alike(d.p, other) for other in ended):
+        if apart < NEARLY and any(_same_solution(d.p, other) for other in ended):
             return d.p, REPEATED, history
         settled = hot <= coldest and apart < NEARLY and _settled(problem, least.min(), margin - margin_before)
         circling = not settled and count >= problem.steps // 3 and apart > CLOSE
@@ -95,11 +95,11 @@ def descend(
     return d.p, f"the limit of {problem.steps} steps", history
 
 
-def _alike(p: Variables, other: Variables) -> bool:
+def _same_solution(p: Variables, other: Variables) -> bool:
     """Whether descents come to one end: states at all knots and durations differ little."""
     states = np.abs(np.asarray(p.state) - np.asarray(other.state)).max((0, 1))
     lasting = np.abs(np.asarray(p.log_duration) - np.asarray(other.log_duration)).max()
-    return bool(np.all(states < ALIKE) and lasting < ALIKE[0])
+    return bool(np.all(states < SAME_SOLUTION_TOL) and lasting < SAME_SOLUTION_TOL[0])
 
 
 def _settled(problem: Problem, least, change) -> bool:

@@ -17,16 +17,16 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from wholearm_jax.core.programs import Beside, beside, wait
+from wholearm_jax.core.programs import BackgroundCall, call_in_background, wait_for
 from wholearm_jax.core.status import Status
 from wholearm_jax.core.validation import require_x64
-from wholearm_jax.margin.quasistatic import coefficients, hold
+from wholearm_jax.margin.quasistatic import affine_coefficients, best_quasistatic_torque
 from wholearm_jax.model.scene import Phase, Scene, replace_duration
-from wholearm_jax.model.schedule import Torque, padded, rounded
-from wholearm_jax.phases.phase import Traced, run, run_blank
+from wholearm_jax.model.schedule import TorqueSchedule, pad_schedule, round_up
+from wholearm_jax.phases.phase import TracedPhase, simulate_phase, precompile_simulation
 from wholearm_jax.phases.plan import require_motion, simulate, trace
 from wholearm_jax.phases.result import Result
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.integrator import IntegratorOptions
 
 STEP = 1.1
 HOLDS = tuple(STEP**-k for k in range(26, 0, -1))  # shares of the torque limits within which a series may begin
@@ -34,17 +34,17 @@ MOST = 60  # raises a series before the search gives up
 
 
 @dataclass(frozen=True)
-class Searched:
+class SearchResult:
     """What the search found: the scene with the durations that came out, the schedule, its simulation and the cost."""
 
     scene: Scene
-    torque: Torque
+    torque: TorqueSchedule
     result: Result
     simulations: int
     seconds: float
 
 
-def search(scene: Scene, *, longest: float = 10.0, traced: tuple[Traced, ...] = ()) -> Searched:
+def search_by_steps(scene: Scene, *, longest: float = 10.0, traced: tuple[TracedPhase, ...] = ()) -> SearchResult:
     """Search each phase's torques by steps of 10 %; no phase may take longer than `longest` seconds.
 
     A phase for which no raise works keeps the attempt with the largest margin, and the result's status says what it
@@ -60,9 +60,9 @@ def search(scene: Scene, *, longest: float = 10.0, traced: tuple[Traced, ...] = 
     require_motion(scene)
     begun = time.perf_counter()
     if not traced:
-        compiled = search_beside()
+        compiled = precompile_search()
         traced = trace(scene)
-        wait(compiled)
+        wait_for(compiled)
     phases, times, rows, start, count = [], [], [], 0.0, 0
     for phase, at in zip(scene.phases, traced, strict=True):
         torque, duration, tried = _search_phase(at, longest)
@@ -72,31 +72,31 @@ def search(scene: Scene, *, longest: float = 10.0, traced: tuple[Traced, ...] = 
         rows += [torque, torque]
         start += duration
     found = eqx.tree_at(lambda s: s.phases, scene, tuple(phases))
-    schedule = Torque(jnp.asarray(times), jnp.asarray(np.array(rows)))
+    schedule = TorqueSchedule(jnp.asarray(times), jnp.asarray(np.array(rows)))
     result = simulate(found, schedule, traced=traced)
-    return Searched(found, schedule, result, count + len(phases), time.perf_counter() - begun)
+    return SearchResult(found, schedule, result, count + len(phases), time.perf_counter() - begun)
 
 
-def search_beside() -> Beside:
-    """Compile what `search` runs in a thread of its own, while wires are traced; it is to be waited for."""
-    return beside(run_blank, rounded(2), Integration())
+def precompile_search() -> BackgroundCall:
+    """Compile what `search_by_steps` runs in a thread of its own, while wires are traced; it is to be waited for."""
+    return call_in_background(precompile_simulation, round_up(2), IntegratorOptions())
 
 
 def _arriving(phase: Phase) -> Phase:
     return Phase(phase.name, phase.formation, phase.heading, phase.duration, arrive="caught")
 
 
-def _search_phase(at: Traced, longest: float) -> tuple[np.ndarray, float, int]:
+def _search_phase(at: TracedPhase, longest: float) -> tuple[np.ndarray, float, int]:
     """Torques, the time the wire takes under them, and the number of simulations."""
     if int(at.table.status) != Status.OK:
         return np.zeros(2), 1.0, 0
-    series = [_raise(at.table, share, longest) for share in HOLDS]
+    series = [_raise_torque(at.table, share, longest) for share in HOLDS]
     count = sum(tried for *_, tried in series)
     torque, duration, _, _ = max(series, key=lambda one: (one[2] is Status.OK, one[3]))[:4]
     return torque, duration, count
 
 
-def _raise(table, share: float, longest: float) -> tuple[np.ndarray, float, Status, float, int]:
+def _raise_torque(table, share: float, longest: float) -> tuple[np.ndarray, float, Status, float, int]:
     """One series of raises from the best hold within a share of the torque limits: the last that worked, or of those
     that failed the one with the largest margin."""
     limit = np.asarray(table.torque_limit)
@@ -124,12 +124,12 @@ def _raise(table, share: float, longest: float) -> tuple[np.ndarray, float, Stat
     return torque, end, status, margin, count
 
 
-_hold, _coefficients = eqx.filter_jit(hold), eqx.filter_jit(coefficients)
+_hold, _coefficients = eqx.filter_jit(best_quasistatic_torque), eqx.filter_jit(affine_coefficients)
 
 
 def _attempt(table, torque, longest) -> tuple[Status, float, float]:
     """One simulation under constant torques: status, margin and the time at which it ended."""
-    schedule = padded(Torque(jnp.asarray([0.0, longest]), jnp.asarray(np.stack([torque, torque]))))
-    outcome = run(table, schedule, jnp.zeros(()), jnp.asarray(longest), Integration(), "caught")
+    schedule = pad_schedule(TorqueSchedule(jnp.asarray([0.0, longest]), jnp.asarray(np.stack([torque, torque]))))
+    outcome = simulate_phase(table, schedule, jnp.zeros(()), jnp.asarray(longest), IntegratorOptions(), "caught")
     end = float(outcome.motion.share[int(outcome.motion.count)]) * longest
     return Status(int(outcome.verdict.status)), float(outcome.score.margin), max(end, 1e-6)

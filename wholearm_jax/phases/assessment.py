@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from wholearm_jax.core.status import Status
-from wholearm_jax.dynamics.path_dynamics import Change, Table
-from wholearm_jax.margin.contact_forces import Score, slack
+from wholearm_jax.dynamics.path_dynamics import Impact, PathDynamics
+from wholearm_jax.margin.contact_forces import MarginResult, force_slack
 from wholearm_jax.simulation.phase_motion import Motion
 
-ARRIVAL = 1e-6  # of the wire's length: how near its end a phase that arrives at rest must come
-BRAKING = 12.0
+DEFAULT_ARRIVAL = 1e-6  # of the wire's length: how near its end a phase that arrives at rest must come
+ARRIVAL_SPEED_FACTOR = 12.0
 """The speed left at arrival within a share `a` of the wire is at most `sqrt(BRAKING a)` wire lengths a duration: what
 braking at 6 lengths a duration squared (the even rest-to-rest motion) ends within `a` of a length. Nearer to the end
 time and position do not fix the speed better than this square root."""
@@ -19,10 +19,10 @@ time and position do not fix the speed better than this square root."""
 GOALS = {"moving": 0, "caught": 0, "rest": 1, "hold": 2}
 """How a phase must end, as a number that compiled programs take: at any speed, at rest, where it began."""
 
-PULL = 1e-9  # share of `Change.size` by which an impulse may be negative for rounding
+IMPULSE_ROUNDING = 1e-9  # share of `Impact.size` by which an impulse may be negative for rounding
 
 
-class Verdict(NamedTuple):
+class Assessment(NamedTuple):
     """A phase's `status`, when as a share of its duration, and the contact concerned (-1: none)."""
 
     status: Int[Array, ""]
@@ -30,14 +30,14 @@ class Verdict(NamedTuple):
     contact: Int[Array, ""]
 
 
-def judge(
-    table: Table,
+def assess_phase(
+    table: PathDynamics,
     motion: Motion,
-    score: Score,
+    score: MarginResult,
     goal: Int[Array, ""],
-    entered: Change,
-    arrival: float | Float[Array, ""] = ARRIVAL,
-) -> Verdict:
+    entered: Impact,
+    arrival: float | Float[Array, ""] = DEFAULT_ARRIVAL,
+) -> Assessment:
     """Decide the status of a phase that must end as `goal` says (one of `GOALS`), within a share `arrival` of its
     wire's length.
 
@@ -47,7 +47,7 @@ def judge(
     """
     at_rest, holds = goal == GOALS["rest"], goal == GOALS["hold"]
     share, s, w = (values[motion.count] for values in (motion.share, motion.s, motion.w))
-    speed = jnp.sqrt(BRAKING * jnp.asarray(arrival, s.dtype))
+    speed = jnp.sqrt(ARRIVAL_SPEED_FACTOR * jnp.asarray(arrival, s.dtype))
     near = jnp.abs(table.breaks[-1] - s) <= arrival * table.length
     slow = w <= speed * table.length
     late = share >= 1 - speed
@@ -64,13 +64,13 @@ def judge(
     lost = jnp.isfinite(score.lost) & ~holds
     status = jnp.where(lost, int(Status.CONTACT_LOST), finish)
     traced = table.status == 0
-    room = slack(table, entered.impulse)  # impulses have the cones of forces
-    pulls = room.min() < -PULL * entered.size
+    room = force_slack(table, entered.impulse)  # impulses have the cones of forces
+    pulls = room.min() < -IMPULSE_ROUNDING * entered.size
     back = entered.speed < 0
     refused = pulls | back
     early = jnp.where(pulls, int(Status.CONTACT_LOST), int(Status.REVERSED))
     contact = jnp.where(pulls, jnp.argmin(room), jnp.where(lost & ~back, score.lost_contact, -1))
-    return Verdict(
+    return Assessment(
         status=jnp.where(traced, jnp.where(refused, early, status), table.status),
         share=jnp.where(traced & ~refused, jnp.where(lost, score.lost, share), 0.0),
         contact=jnp.where(traced, contact, -1),

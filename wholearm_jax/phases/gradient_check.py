@@ -18,9 +18,9 @@ import optax
 
 from wholearm_jax.core.validation import require_x64
 from wholearm_jax.model.scene import Scene
-from wholearm_jax.model.schedule import Torque
+from wholearm_jax.model.schedule import TorqueSchedule
 from wholearm_jax.phases.plan import margin
-from wholearm_jax.simulation.integrator import Integration
+from wholearm_jax.simulation.integrator import IntegratorOptions
 
 TOLERANCES = (1e-8, 1e-10, 1e-12)
 STEPS = tuple(1e-3 / 5**k for k in range(5))  # largest relative changes of the inputs for differences
@@ -31,7 +31,7 @@ LEAST = 1e-9  # slopes smaller than this [N] count as nothing
 
 
 @dataclass(frozen=True)
-class Slope:
+class DirectionalDerivative:
     """The margin's slope [N] along a relative change of a group of inputs, three ways, and what the differences may be
     off by."""
 
@@ -55,8 +55,8 @@ class Slope:
 
 
 def check_gradient(
-    scene: Scene, torque: Torque, *, tolerances: tuple[float, ...] = TOLERANCES, seed: int = 0
-) -> tuple[Slope, ...]:
+    scene: Scene, torque: TorqueSchedule, *, tolerances: tuple[float, ...] = TOLERANCES, seed: int = 0
+) -> tuple[DirectionalDerivative, ...]:
     """Slopes of `margin` for each group of inputs and each of `tolerances`.
 
     Raises ValueError where the plan has no margin to differentiate.
@@ -66,7 +66,7 @@ def check_gradient(
 
     def value(inputs, tolerance, adjoint):
         # A tolerance that is an array is data: all tolerances share their programs.
-        how = Integration(tolerance=jnp.asarray(tolerance), adjoint=adjoint)
+        how = IntegratorOptions(tolerance=jnp.asarray(tolerance), adjoint=adjoint)
         return margin(*eqx.combine(inputs, rest), how=how)
 
     if not np.isfinite(float(value(floats, 1e-8, "none"))):
@@ -83,7 +83,7 @@ def check_gradient(
 
             ladder = [_richardson(along, step) for step in STEPS]
             change, best = _steadiest(ladder)
-            found.append(Slope(name, tolerance, float(forward), reverse, best, change))
+            found.append(DirectionalDerivative(name, tolerance, float(forward), reverse, best, change))
     return tuple(found)
 
 

@@ -1,7 +1,7 @@
 """Gradient: the margin and its derivatives with respect to the torques, in the mode that costs less.
 
 Forward mode carries one direction for each torque, reverse mode goes back through the steps once, however many there
-are. Measured (`benchmarks/gradients.py`), the first is cheaper for schedules of up to `FORWARD` rows.
+are. Measured (`benchmarks/gradients.py`), the first is cheaper for schedules of up to `MAX_FORWARD_DIRECTIONS` rows.
 """
 
 import equinox as eqx
@@ -10,16 +10,16 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.core.validation import require_x64
 from wholearm_jax.model.scene import Scene
-from wholearm_jax.model.schedule import Torque
-from wholearm_jax.phases.phase import Traced
-from wholearm_jax.phases.plan import least, outcomes, roomy, steps_within, trace
-from wholearm_jax.simulation.integrator import Integration, tolerance_as_data
+from wholearm_jax.model.schedule import TorqueSchedule
+from wholearm_jax.phases.phase import TracedPhase
+from wholearm_jax.phases.plan import plan_margin, simulate_phases, with_plan_step_capacity, has_torque_jumps, trace
+from wholearm_jax.simulation.integrator import IntegratorOptions, tolerance_as_data
 
-FORWARD = 2
+MAX_FORWARD_DIRECTIONS = 2
 
 
 def torque_gradient(
-    scene: Scene, torque: Torque, *, traced: tuple[Traced, ...] = (), tolerance: float = 1e-10
+    scene: Scene, torque: TorqueSchedule, *, traced: tuple[TracedPhase, ...] = (), tolerance: float = 1e-10
 ) -> tuple[Float[Array, ""], Float[Array, "rows 2"]]:
     """The margin `m` [N] of a plan as by `plan.margin`, and `dm/dtau` [1/m] at every row of its schedule.
 
@@ -32,20 +32,20 @@ def torque_gradient(
     (12, 2)
     """
     require_x64()
-    how = Integration(tolerance=tolerance, adjoint=mode(torque), steps=steps_within(scene, torque))
-    how = tolerance_as_data(roomy(how, scene, torque), torque.times.dtype)
+    how = IntegratorOptions(tolerance=tolerance, adjoint=choose_mode(torque), steps=has_torque_jumps(scene, torque))
+    how = tolerance_as_data(with_plan_step_capacity(how, scene, torque), torque.times.dtype)
     return _gradient(scene, torque, traced or trace(scene), how)
 
 
-def mode(torque: Torque) -> str:
+def choose_mode(torque: TorqueSchedule) -> str:
     """`"forward"` or `"reverse"`: the mode that costs less for a schedule."""
-    return "forward" if torque.times.shape[0] <= FORWARD else "reverse"
+    return "forward" if torque.times.shape[0] <= MAX_FORWARD_DIRECTIONS else "reverse"
 
 
 @eqx.filter_jit
 def _gradient(scene, torque, traced, how):
     def value(values):
-        m = least(scene, outcomes(scene, Torque(torque.times, values), traced, how))
+        m = plan_margin(scene, simulate_phases(scene, TorqueSchedule(torque.times, values), traced, how))
         return m, m
 
     derivative = jax.jacfwd if how.adjoint == "forward" else jax.grad

@@ -1,7 +1,7 @@
 """Plans: trace and simulate a scene's phases one after the other, and say what became of them.
 
 Each phase starts where the wire of the phase before it ended: at rest, or, where that phase arrives `moving`, with the
-speed that the impact leaves (`reduction.change`), at the moment when the formation changes. It has time until its
+speed that the impact leaves (`reduction.resolve_impact`), at the moment when the formation changes. It has time until its
 planned end.
 """
 
@@ -14,36 +14,36 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core.arrays import array
-from wholearm_jax.core.programs import Beside, beside, transformed, wait
+from wholearm_jax.core.arrays import as_device_array
+from wholearm_jax.core.programs import BackgroundCall, call_in_background, is_transformed, wait_for
 from wholearm_jax.core.status import Status
 from wholearm_jax.core.validation import require_positive, require_x64
-from wholearm_jax.model.mechanics import system
-from wholearm_jax.model.scene import Phase, Scene, body
-from wholearm_jax.model.schedule import Torque, has_steps, padded, rounded
-from wholearm_jax.phases.assessment import ARRIVAL, GOALS
+from wholearm_jax.model.mechanics import scaled_mechanics
+from wholearm_jax.model.scene import Phase, Scene, rigid_body
+from wholearm_jax.model.schedule import TorqueSchedule, has_jumps, pad_schedule, round_up
+from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL, GOALS
 from wholearm_jax.phases.phase import (
-    Outcome,
-    Traced,
-    destination,
-    follow,
-    prepare,
-    run,
-    run_blank,
+    SimulatedPhase,
+    TracedPhase,
+    target_configuration,
+    trace_phase_path,
+    trace_phase,
+    simulate_phase,
+    precompile_simulation,
 )
-from wholearm_jax.phases.result import Result, describe
-from wholearm_jax.simulation.integrator import Integration, tolerance_as_data, with_room
-from wholearm_jax.tracing.path import Resolution, Wire
+from wholearm_jax.phases.result import Result, build_result
+from wholearm_jax.simulation.integrator import IntegratorOptions, tolerance_as_data, with_step_capacity
+from wholearm_jax.tracing.path import Resolution, ContactPath
 
-ROUNDING = 1e4  # of a precision's last digit, the interpolation error that more panels do not make smaller
+TABLE_ROUNDING = 1e4  # of a precision's last digit, the interpolation error that more panels do not make smaller
 
 
-def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: float = 1e-9) -> tuple[Traced, ...]:
+def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: float = 1e-9) -> tuple[TracedPhase, ...]:
     """Trace and tabulate every phase of a plan.
 
     The table of a phase is refined (panels doubled, up to 512) until its interpolation error, relative to each
     function's size, is below `tolerance`; pieces are added likewise. What cannot be traced says so in
-    `Traced.table.status`, and what follows it cannot be trusted.
+    `TracedPhase.table.status`, and what follows it cannot be trusted.
 
     The paper's "set of C-functions equated to zero", solved along the whole wire (derivation, section 3).
 
@@ -53,68 +53,68 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     >>> print(f"{float(traced[0].table.length):.2f} object radii")
     1.33 object radii
     """
-    if transformed(scene):  # shapes are fixed there: the caller has chosen the resolution
-        return _apart(traced_together(scene, resolution), len(scene.phases))
-    solid, rough, found = body(scene.object), scene.start, []
+    if is_transformed(scene):  # shapes are fixed there: the caller has chosen the resolution
+        return unstack_trees(trace_in_one_program(scene, resolution), len(scene.phases))
+    solid, rough, found = rigid_body(scene.object), scene.start, []
     for phase in scene.phases:
-        begin = rough, array(not found)
-        traced = _refined(solid, scene, phase, *begin, resolution, tolerance)
+        begin = rough, as_device_array(not found)
+        traced = _trace_refined(solid, scene, phase, *begin, resolution, tolerance)
         if phase.arrive == "hold" and int(traced.table.status) != Status.OK:
             other = eqx.tree_at(lambda p: p.heading.sign, phase, -phase.heading.sign)
-            traced = _refined(solid, scene, other, *begin, resolution, tolerance)
+            traced = _trace_refined(solid, scene, other, *begin, resolution, tolerance)
         found.append(traced)
-        rough = destination(phase, traced)
+        rough = target_configuration(phase, traced)
     return tuple(found)
 
 
 @eqx.filter_jit
-def traced_together(scene: Scene, resolution: Resolution) -> Traced:
-    """Every phase of a plan in one program: `Traced` with an axis of phases."""
-    solid = body(scene.object)
+def trace_in_one_program(scene: Scene, resolution: Resolution) -> TracedPhase:
+    """Every phase of a plan in one program: `TracedPhase` with an axis of phases."""
+    solid = rigid_body(scene.object)
 
     def one(at, phase):
         """Trace a phase from where the one before it ended."""
         (rough, first), (formation, heading, holds) = at, phase
-        traced = prepare(solid, scene.hand, scene.gravity, formation, rough, heading, resolution, first, holds)
+        traced = trace_phase(solid, scene.hand, scene.gravity, formation, rough, heading, resolution, first, holds)
         return (jnp.where(holds, traced.begin, traced.end), jnp.asarray(False)), traced
 
-    return jax.lax.scan(one, (scene.start, jnp.asarray(True)), _traced_told(scene))[1]
+    return jax.lax.scan(one, (scene.start, jnp.asarray(True)), _trace_inputs(scene))[1]
 
 
-def wires_together(scene: Scene, resolution: Resolution) -> Wire:
-    """The wires alone: `Wire` with an axis of phases."""
-    solid = body(scene.object)
+def trace_paths_in_one_program(scene: Scene, resolution: Resolution) -> ContactPath:
+    """The wires alone: `ContactPath` with an axis of phases."""
+    solid = rigid_body(scene.object)
 
     def one(at, phase):
         (rough, first), (formation, heading, holds) = at, phase
-        mechanics = system(solid, scene.hand, scene.gravity, formation)
-        wire, begin, end = follow(mechanics, rough, heading, resolution, first, holds)
+        mechanics = scaled_mechanics(solid, scene.hand, scene.gravity, formation)
+        wire, begin, end = trace_phase_path(mechanics, rough, heading, resolution, first, holds)
         return (jnp.where(holds, begin, end), jnp.asarray(False)), wire
 
-    return jax.lax.scan(one, (scene.start, jnp.asarray(True)), _traced_told(scene))[1]
+    return jax.lax.scan(one, (scene.start, jnp.asarray(True)), _trace_inputs(scene))[1]
 
 
-def _traced_told(scene: Scene):
+def _trace_inputs(scene: Scene):
     """What a plan says of its phases' wires, with an axis of phases: formation, heading, and whether it only holds."""
-    return stacked([(p.formation, p.heading, jnp.asarray(p.arrive == "hold")) for p in scene.phases])
+    return stack_trees([(p.formation, p.heading, jnp.asarray(p.arrive == "hold")) for p in scene.phases])
 
 
-def stacked(several):
+def stack_trees(several):
     """Trees of one kind as one with a leading axis."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
 
 
-def _apart(together, count: int) -> tuple:
+def unstack_trees(together, count: int) -> tuple:
     """The `count` trees that are stacked in one."""
     return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], together) for k in range(count))
 
 
-def _refined(solid, scene, phase: Phase, rough, first, resolution: Resolution, tolerance: float) -> Traced:
-    told, holds = (phase.formation, rough, phase.heading), array(phase.arrive == "hold")
+def _trace_refined(solid, scene, phase: Phase, rough, first, resolution: Resolution, tolerance: float) -> TracedPhase:
+    told, holds = (phase.formation, rough, phase.heading), as_device_array(phase.arrive == "hold")
     while True:
-        traced = prepare(solid, scene.hand, scene.gravity, *told, resolution, first, holds)
+        traced = trace_phase(solid, scene.hand, scene.gravity, *told, resolution, first, holds)
         table = traced.table
-        least_error = ROUNDING * jnp.finfo(table.breaks.dtype).eps
+        least_error = TABLE_ROUNDING * jnp.finfo(table.breaks.dtype).eps
         coarse = float(table.error) > max(tolerance, least_error) and int(table.status) == Status.OK
         full = int(table.count) >= resolution.pieces
         if full and resolution.pieces < 48:
@@ -127,57 +127,57 @@ def _refined(solid, scene, phase: Phase, rough, first, resolution: Resolution, t
             return traced
 
 
-def outcomes(
-    scene: Scene, torque: Torque, traced: tuple[Traced, ...], how: Integration, arrival: float = ARRIVAL
-) -> tuple[Outcome, ...]:
+def simulate_phases(
+    scene: Scene, torque: TorqueSchedule, traced: tuple[TracedPhase, ...], how: IntegratorOptions, arrival: float = DEFAULT_ARRIVAL
+) -> tuple[SimulatedPhase, ...]:
     """Simulate every phase; differentiable, and usable under any JAX transformation."""
     alike = len({tuple(leaf.shape for leaf in jax.tree.leaves(one)) for one in traced}) == 1
-    if alike and transformed(scene, torque, traced):
-        phases = stacked([(at.table, *simulate_told(phase)) for at, phase in zip(traced, scene.phases, strict=True)])
+    if alike and is_transformed(scene, torque, traced):
+        phases = stack_trees([(at.table, *phase_inputs(phase)) for at, phase in zip(traced, scene.phases, strict=True)])
         dtype = torque.times.dtype
         how = tolerance_as_data(how, dtype)
-        return _apart(_outcomes_together(phases, padded(torque), how, jnp.asarray(arrival, dtype)), len(traced))
-    at, found, schedule = simulate_first(torque), [], padded(torque)
+        return unstack_trees(_simulate_in_one_program(phases, pad_schedule(torque), how, jnp.asarray(arrival, dtype)), len(traced))
+    at, found, schedule = initial_carry(torque), [], pad_schedule(torque)
     for phase, one in zip(scene.phases, traced, strict=True):
-        at, outcome = simulate_next(schedule, how, arrival, at, (one.table, *simulate_told(phase)))
+        at, outcome = scan_step(schedule, how, arrival, at, (one.table, *phase_inputs(phase)))
         found.append(outcome)
     return tuple(found)
 
 
 @eqx.filter_jit
-def _outcomes_together(phases, schedule: Torque, how: Integration, arrival) -> Outcome:
-    """Every phase of a plan in one program: `Outcome` with an axis of phases."""
-    return jax.lax.scan(partial(simulate_next, schedule, how, arrival), simulate_first(schedule), phases)[1]
+def _simulate_in_one_program(phases, schedule: TorqueSchedule, how: IntegratorOptions, arrival) -> SimulatedPhase:
+    """Every phase of a plan in one program: `SimulatedPhase` with an axis of phases."""
+    return jax.lax.scan(partial(scan_step, schedule, how, arrival), initial_carry(schedule), phases)[1]
 
 
-def simulate_first(torque: Torque):
-    """When a plan begins, when it should, and at which `z_dot`: what `simulate_next` needs of the phases before."""
-    zero = array(0.0, torque.times.dtype)
-    return zero, zero, array(np.zeros(5), zero.dtype)
+def initial_carry(torque: TorqueSchedule):
+    """When a plan begins, when it should, and at which `z_dot`: what `scan_step` needs of the phases before."""
+    zero = as_device_array(0.0, torque.times.dtype)
+    return zero, zero, as_device_array(np.zeros(5), zero.dtype)
 
 
-def simulate_told(phase: Phase):
+def phase_inputs(phase: Phase):
     """What a plan says of a phase's motion: its duration, its goal, and whether the next takes over at speed."""
-    return phase.duration, array(GOALS[phase.arrive], int), array(phase.arrive == "moving")
+    return phase.duration, as_device_array(GOALS[phase.arrive], int), as_device_array(phase.arrive == "moving")
 
 
-def simulate_next(schedule: Torque, how: Integration, arrival, at, phase):
+def scan_step(schedule: TorqueSchedule, how: IntegratorOptions, arrival, at, phase):
     """Simulate the next phase of a plan, from when the one before it ended: one step of a scan."""
     (start, planned, arriving), (table, duration, goal, passes) = at, phase
-    planned, length = _planned(planned, duration, start)
-    one = run(table, schedule, start, length, how, goal, arriving, arrival)
-    return _following(planned, passes, one), one
+    planned, length = _planned_end(planned, duration, start)
+    one = simulate_phase(table, schedule, start, length, how, goal, arriving, arrival)
+    return _next_start(planned, passes, one), one
 
 
 @jax.jit  # outside of other programs, one compiles sooner than its operations one by one
-def _planned(before, duration, start):
+def _planned_end(before, duration, start):
     """When a phase should end, and how long it has."""
     planned = before + duration
     return planned, planned - start
 
 
 @jax.jit
-def _following(planned, passes, one: Outcome):
+def _next_start(planned, passes, one: SimulatedPhase):
     """When the next phase begins, when this one should have ended, and at which `z_dot`."""
     ended = one.start + one.duration * one.motion.share[one.motion.count]
     return jnp.where(passes, ended, planned), planned, jnp.where(passes, one.leaving, 0.0)
@@ -185,9 +185,9 @@ def _following(planned, passes, one: Outcome):
 
 def margin(
     scene: Scene,
-    torque: Torque,
+    torque: TorqueSchedule,
     *,
-    how: Integration = Integration(adjoint="both"),
+    how: IntegratorOptions = IntegratorOptions(adjoint="both"),
     resolution: Resolution = Resolution(),
 ) -> Float[Array, ""]:
     """The compressive margin [N] of a plan: the least `c_n` over time and contacts (and, of those that roll, the least
@@ -206,11 +206,11 @@ def margin(
     >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")
     0.70 N
     """
-    how = replace(roomy(how, scene, torque), steps=how.steps or steps_within(scene, torque))
-    return least(scene, outcomes(scene, torque, trace(scene, resolution=resolution), how))
+    how = replace(with_plan_step_capacity(how, scene, torque), steps=how.steps or has_torque_jumps(scene, torque))
+    return plan_margin(scene, simulate_phases(scene, torque, trace(scene, resolution=resolution), how))
 
 
-def least(scene: Scene, found: tuple[Outcome, ...]) -> Float[Array, ""]:
+def plan_margin(scene: Scene, found: tuple[SimulatedPhase, ...]) -> Float[Array, ""]:
     """The least margin [N] of simulated phases, those that hold left out; `-inf` where one has no motion to score.
 
     Raises ValueError for a plan that only holds its object.
@@ -228,7 +228,7 @@ def require_motion(scene: Scene) -> None:
             raise ValueError(f"phase '{phase.name}' holds the object; this is for phases that move it")
 
 
-def require_covered(scenes: Scene, torque: Torque) -> None:
+def require_covered(scenes: Scene, torque: TorqueSchedule) -> None:
     """Raise ValueError for a schedule that is shorter than the plan, or than the longest plan of stacked scenes."""
     total = float(np.max(sum(np.asarray(p.duration) for p in scenes.phases)))
     first, last = float(torque.times[0]), float(torque.times[-1])
@@ -238,12 +238,12 @@ def require_covered(scenes: Scene, torque: Torque) -> None:
 
 def simulate(
     scene: Scene,
-    torque: Torque,
+    torque: TorqueSchedule,
     *,
     tolerance: float = 1e-10,
     max_steps: int = 256,
-    traced: tuple[Traced, ...] = (),
-    arrival: float = ARRIVAL,
+    traced: tuple[TracedPhase, ...] = (),
+    arrival: float = DEFAULT_ARRIVAL,
 ) -> Result:
     """Simulate a plan under a torque schedule and judge it.
 
@@ -264,44 +264,44 @@ def simulate(
     require_positive(tolerance=tolerance, max_steps=max_steps, arrival=arrival)
     require_covered(scene, torque)
     if not traced:
-        compiled = simulate_beside(scene, torque, tolerance, max_steps)
+        compiled = precompile_simulate(scene, torque, tolerance, max_steps)
         traced = trace(scene)
-        wait(compiled)
+        wait_for(compiled)
     while True:
-        found = outcomes(scene, torque, traced, _integration(scene, torque, tolerance, max_steps), arrival)
+        found = simulate_phases(scene, torque, traced, _integrator_options(scene, torque, tolerance, max_steps), arrival)
         short = any(int(o.verdict.status) == Status.MAX_STEPS for o in found)
         if not short or max_steps >= 16384:
-            return describe(scene, torque, traced, found)
+            return build_result(scene, torque, traced, found)
         max_steps *= 4
 
 
-def simulate_beside(scene: Scene, torque: Torque, tolerance: float = 1e-10, max_steps: int = 256) -> Beside:
+def precompile_simulate(scene: Scene, torque: TorqueSchedule, tolerance: float = 1e-10, max_steps: int = 256) -> BackgroundCall:
     """Compile what `simulate` runs in a thread of its own, while wires are traced; it is to be waited for."""
-    return beside(run_blank, rounded(len(torque.times)), _integration(scene, torque, tolerance, max_steps))
+    return call_in_background(precompile_simulation, round_up(len(torque.times)), _integrator_options(scene, torque, tolerance, max_steps))
 
 
-def _integration(scene: Scene, torque: Torque, tolerance: float, max_steps: int) -> Integration:
+def _integrator_options(scene: Scene, torque: TorqueSchedule, tolerance: float, max_steps: int) -> IntegratorOptions:
     """How `simulate` integrates."""
-    stages, steps = max(8, max_steps // 32), steps_within(scene, torque)
-    return roomy(Integration(tolerance=tolerance, max_steps=max_steps, stages=stages, steps=steps), scene, torque)
+    stages, steps = max(8, max_steps // 32), has_torque_jumps(scene, torque)
+    return with_plan_step_capacity(IntegratorOptions(tolerance=tolerance, max_steps=max_steps, stages=stages, steps=steps), scene, torque)
 
 
-def roomy(how: Integration, scene: Scene, torque: Torque) -> Integration:
-    """The same integration with room for the steps of a phase under a schedule (`stepping.with_room`).
+def with_plan_step_capacity(how: IntegratorOptions, scene: Scene, torque: TorqueSchedule) -> IntegratorOptions:
+    """The same integration with room for the steps of a phase under a schedule (`stepping.with_step_capacity`).
 
     Counted are the rows within a phase, or all where times or durations are being transformed.
     """
     rows = torque.times.shape[0]
-    if not transformed(torque.times, [phase.duration for phase in scene.phases]):
+    if not is_transformed(torque.times, [phase.duration for phase in scene.phases]):
         ends = np.cumsum([0.0, *(float(phase.duration) for phase in scene.phases)])
         rows = int(np.max(np.diff(np.searchsorted(np.asarray(torque.times), ends))))
-    return with_room(how, rows)
+    return with_step_capacity(how, rows)
 
 
-def steps_within(scenes: Scene, torque: Torque) -> bool:
+def has_torque_jumps(scenes: Scene, torque: TorqueSchedule) -> bool:
     """Whether a schedule steps within a phase of a scene, or of one of stacked scenes; times and durations that are
     being transformed count as they do not."""
-    if transformed(torque.times, [phase.duration for phase in scenes.phases]):
+    if is_transformed(torque.times, [phase.duration for phase in scenes.phases]):
         return False
     ends = np.cumsum([np.asarray(phase.duration) for phase in scenes.phases], axis=0)
     first = 0.0
@@ -309,6 +309,6 @@ def steps_within(scenes: Scene, torque: Torque) -> bool:
         # Who passes on at speed may do so early: then the next phase has what was meant for it.
         if before is None or before.arrive != "moving":
             first = float(np.min(end - np.asarray(phase.duration)))
-        if has_steps(torque, first, float(np.max(end))):
+        if has_jumps(torque, first, float(np.max(end))):
             return True
     return False

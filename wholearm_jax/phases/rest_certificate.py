@@ -12,57 +12,57 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from wholearm_jax.core.lookup import pick
-from wholearm_jax.core.small_linalg import inverse, times
-from wholearm_jax.dynamics.path_dynamics import Table, balance, on_panel, powers
-from wholearm_jax.margin.contact_forces import slack
-from wholearm_jax.model.mechanics import System
-from wholearm_jax.model.schedule import ROUNDING, Torque, Window, torque_in, window
-from wholearm_jax.phases.phase import Outcome
-from wholearm_jax.phases.result import BRIEF
+from wholearm_jax.core.lookup import take_row
+from wholearm_jax.core.small_linalg import inverse_and_determinant, fused_matmul
+from wholearm_jax.dynamics.path_dynamics import PathDynamics, equations_of_motion, evaluate, locate_panel
+from wholearm_jax.margin.contact_forces import force_slack
+from wholearm_jax.model.mechanics import ScaledMechanics
+from wholearm_jax.model.schedule import TIME_ROUNDING, TorqueSchedule, PhaseSchedule, torque_at, restrict_to_phase
+from wholearm_jax.phases.phase import SimulatedPhase
+from wholearm_jax.phases.result import MIN_REST
 from wholearm_jax.simulation.phase_motion import Motion
 
 
-def surely_held(mechanics: System, table: Table, schedule: Torque, done: Outcome) -> Bool[Array, ""]:
+def certify_rest(mechanics: ScaledMechanics, table: PathDynamics, schedule: TorqueSchedule, done: SimulatedPhase) -> Bool[Array, ""]:
     """Whether every time that friction holds the object at rest in a phase is proved to be possible."""
     motion = done.motion
     rows = jnp.arange(motion.held.shape[0])
-    rests = motion.held & (rows < motion.count) & (jnp.diff(motion.share) > BRIEF)
+    rests = motion.held & (rows < motion.count) & (jnp.diff(motion.share) > MIN_REST)
 
     def all_proved():
-        seen = window(schedule, done.start, done.duration)
+        seen = restrict_to_phase(schedule, done.start, done.duration)
 
         def next_rest(at):
             left, _ = at
             k = jnp.argmax(left)
-            return left.at[k].set(False), _proved(mechanics, table, seen, motion, k)
+            return left.at[k].set(False), _certify_interval(mechanics, table, seen, motion, k)
 
         return jax.lax.while_loop(lambda at: at[1] & at[0].any(), next_rest, (rests, jnp.asarray(True)))[1]
 
     return jax.lax.cond(rests.any(), all_proved, lambda: jnp.asarray(True))
 
 
-def _proved(mechanics: System, table: Table, seen: Window, motion: Motion, k) -> Bool[Array, ""]:
+def _certify_interval(mechanics: ScaledMechanics, table: PathDynamics, seen: PhaseSchedule, motion: Motion, k) -> Bool[Array, ""]:
     """Whether one rest, step `k` of a motion, is."""
-    piece, begin, end = pick(motion.piece, k), pick(motion.share, k), pick(motion.share, k + 1)
-    panel, xi = powers(table, piece, pick(motion.s, k))
+    piece, begin, end = take_row(motion.piece, k), take_row(motion.share, k), take_row(motion.share, k + 1)
+    panel, xi = locate_panel(table, piece, take_row(motion.s, k))
     z, x = (
-        on_panel(values, panel, xi) / mechanics.configuration_unit for values in (table.configuration, table.velocity)
+        evaluate(values, panel, xi) / mechanics.configuration_unit for values in (table.configuration, table.velocity)
     )
     friction = mechanics.contacts.friction
-    sliding = -pick(table.tension, piece) / jnp.where(friction > 0, friction, 1.0)  # signs of slip, as traced
+    sliding = -take_row(table.tension, piece) / jnp.where(friction > 0, friction, 1.0)  # signs of slip, as traced
     # At a step the torque is that before it where a rest ends, and that behind it where one begins.
-    near = ROUNDING * jnp.finfo(end.dtype).eps
+    near = TIME_ROUNDING * jnp.finfo(end.dtype).eps
     first, last = (seen.share <= begin + near).sum() - 1, (seen.share < end - near).sum() - 1
     rows = (jnp.clip(row, seen.first, seen.last) for row in (first, last))
-    ends = jnp.stack([torque_in(seen, row, at) for row, at in zip(rows, (begin, end), strict=True)])
+    ends = jnp.stack([torque_at(seen, row, at) for row, at in zip(rows, (begin, end), strict=True)])
     inside = (seen.share > begin + near) & (seen.share < end - near)
     corners = jnp.concatenate([ends, jnp.where(inside[:, None], seen.values, ends[0])]) / mechanics.torque_unit
     terms = jnp.concatenate([jnp.ones_like(corners[:, :1]), corners], axis=1)
 
     def within(sign):
-        matrix, right = balance(mechanics, z, x, jnp.zeros_like(x), sign * sliding, sign * jnp.sign(x[3:]))
-        solved = times(inverse(matrix)[0], right[:, jnp.array([0, 3, 4])])[1:]
-        return jax.vmap(lambda one: slack(table, times(solved, one)))(terms).min() >= 0
+        matrix, right = equations_of_motion(mechanics, z, x, jnp.zeros_like(x), sign * sliding, sign * jnp.sign(x[3:]))
+        solved = fused_matmul(inverse_and_determinant(matrix)[0], right[:, jnp.array([0, 3, 4])])[1:]
+        return jax.vmap(lambda one: force_slack(table, fused_matmul(solved, one)))(terms).min() >= 0
 
     return jax.lax.map(within, jnp.array([1.0, -1.0])).all()

@@ -9,13 +9,13 @@ import jax
 import numpy as np
 
 from wholearm_jax.core.status import Status
-from wholearm_jax.margin.statics import Held, statics, watch
+from wholearm_jax.margin.statics import RestInterval, contact_statics, rest_margin
 from wholearm_jax.model.scene import Phase, Scene
-from wholearm_jax.model.schedule import Torque
-from wholearm_jax.phases.phase import Outcome, Traced, configuration
+from wholearm_jax.model.schedule import TorqueSchedule
+from wholearm_jax.phases.phase import SimulatedPhase, TracedPhase, configuration
 
-SLIPPING = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
-BRIEF = 1e-9  # share of a phase: an object that comes to rest at its end does so earlier or later by rounding
+SLIP_TOL = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
+MIN_REST = 1e-9  # share of a phase: an object that comes to rest at its end does so earlier or later by rounding
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class PhaseResult:
 
     `time` is when the phase ended or failed. A phase that is entered while moving begins at `start` with `impulses`
     [N s], one a contact.
-    `slips` says that the contact lost is one that should roll, and that it leaves its friction cone.
+    `slip_velocity` says that the contact lost is one that should roll, and that it leaves its friction cone.
     `margin` is the least force while the object moves; while friction holds it at rest forces are not determined, and
-    `holds` says what the contacts can do. A phase that only holds has the margin of its hold.
+    `best_quasistatic_torque_batch` says what the contacts can do. A phase that only holds has the margin of its hold.
     """
 
     name: str
@@ -43,9 +43,9 @@ class PhaseResult:
     margin_s: float
     margin_contact: str
     impulses: tuple[float, ...]
-    holds: tuple[Held, ...]
-    traced: Traced
-    outcome: Outcome
+    holds: tuple[RestInterval, ...]
+    traced: TracedPhase
+    outcome: SimulatedPhase
 
     @property
     def message(self) -> str:
@@ -53,7 +53,7 @@ class PhaseResult:
         if self.status is Status.OK:
             return f"{self.name}: ok, margin {self.margin:.4g} N at {self.margin_contact}, t = {self.margin_time:.4g} s"
         whose = f" at {self.contact}" if self.contact else ""
-        advice = SLIPPING if self.slips else self.status.advice
+        advice = SLIP_TOL if self.slips else self.status.advice
         rests = self.status is Status.STUCK and self.holds
         since = f", at rest since {self.holds[-1].start:.6g} s" if rests else ""
         return f"{self.name}: {self.status.label}{whose}, t = {self.time:.6g} s{since}: {advice}"
@@ -68,7 +68,7 @@ class Result:
     """
 
     scene: Scene
-    torque: Torque
+    torque: TorqueSchedule
     phases: tuple[PhaseResult, ...]
 
     @property
@@ -96,7 +96,7 @@ class Result:
         return next(failed, f"ok, margin {self.margin:.4g} N")
 
 
-def describe(scene: Scene, torque: Torque, traced, found) -> Result:
+def build_result(scene: Scene, torque: TorqueSchedule, traced, found) -> Result:
     """Arrays as a readable result."""
     rows = []
     for phase, at, outcome in zip(scene.phases, traced, found, strict=True):
@@ -119,7 +119,7 @@ def describe(scene: Scene, torque: Torque, traced, found) -> Result:
             margin_s=float(scored.s),
             margin_contact=names[of_slot[int(scored.contact)]],
             impulses=tuple(float(np.asarray(outcome.entered.impulse)[k]) for k in phase.formation.normal_slots),
-            holds=stays(scene, torque, phase, at, outcome),
+            holds=rest_intervals(scene, torque, phase, at, outcome),
             traced=at,
             outcome=outcome,
         )
@@ -127,17 +127,17 @@ def describe(scene: Scene, torque: Torque, traced, found) -> Result:
     return Result(scene, torque, tuple(rows))
 
 
-def stays(scene: Scene, torque: Torque, phase: Phase, traced: Traced, outcome: Outcome) -> tuple[Held, ...]:
+def rest_intervals(scene: Scene, torque: TorqueSchedule, phase: Phase, traced: TracedPhase, outcome: SimulatedPhase) -> tuple[RestInterval, ...]:
     """Every time that friction holds the object at rest in a phase: waiting to start, or stopped on the way."""
     motion = jax.device_get(outcome.motion)
     if int(traced.table.status) != Status.OK:
         return ()
     start, duration = float(outcome.start), float(outcome.duration)
     found = []
-    for k in np.flatnonzero(motion.held[: int(motion.count)] & (np.diff(motion.share)[: int(motion.count)] > BRIEF)):
+    for k in np.flatnonzero(motion.held[: int(motion.count)] & (np.diff(motion.share)[: int(motion.count)] > MIN_REST)):
         z = configuration(traced.table, motion.piece[k], motion.s[k])
         begin, end = (start + duration * float(share) for share in motion.share[k : k + 2])
-        found.append(watch(statics(scene, phase.formation, z), torque, begin, end))
+        found.append(rest_margin(contact_statics(scene, phase.formation, z), torque, begin, end))
     return tuple(found)
 
 

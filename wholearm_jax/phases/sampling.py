@@ -10,13 +10,13 @@ from jaxtyping import Array, Float
 from wholearm_jax.core.programs import Program
 from wholearm_jax.core.status import Status
 from wholearm_jax.core.validation import require_positive
-from wholearm_jax.dynamics.path_dynamics import Table, on_panel, powers
-from wholearm_jax.margin.contact_forces import arcs, force, on_arc
-from wholearm_jax.model.schedule import Torque, interval, padded, rounded, torque_in, window
+from wholearm_jax.dynamics.path_dynamics import PathDynamics, evaluate, locate_panel
+from wholearm_jax.margin.contact_forces import dense_output, contact_force, evaluate_dense
+from wholearm_jax.model.schedule import TorqueSchedule, interval, pad_schedule, round_up, torque_at, restrict_to_phase
 from wholearm_jax.phases.result import Result
 from wholearm_jax.simulation.phase_motion import Motion
 
-SAMPLED = 1024  # samples of a phase that one call computes: numbers of samples that differ share a program
+DEFAULT_SAMPLES = 1024  # samples of a phase that one call computes: numbers of samples that differ share a program
 
 
 class Trajectory(NamedTuple):
@@ -34,7 +34,7 @@ class Trajectory(NamedTuple):
     ct: Float[Array, "samples contacts"]
 
 
-def by_contact(table: Table, piece, forces: Float[Array, "slots"]):
+def by_contact(table: PathDynamics, piece, forces: Float[Array, "slots"]):
     """`c_n` and `c_t` of every contact from the forces in the constraints; NaN beyond the last contact."""
     rolls = jnp.roll(table.tangential, -1)
     tangential = jnp.where(rolls, jnp.roll(forces, -1), forces * table.tension[piece])
@@ -43,10 +43,10 @@ def by_contact(table: Table, piece, forces: Float[Array, "slots"]):
 
 
 @Program
-def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shares) -> Trajectory:
+def sample_phase(table: PathDynamics, schedule: TorqueSchedule, start, duration, motion: Motion, shares) -> Trajectory:
     """A phase's motion at given shares of its duration; beyond its end the object rests there."""
-    seen = window(schedule, start, duration)
-    steps = arcs(table, seen, duration, motion)
+    seen = restrict_to_phase(schedule, start, duration)
+    steps = dense_output(table, seen, duration, motion)
     rows = jnp.arange(steps.live.shape[0])
 
     def one(share):
@@ -54,15 +54,15 @@ def sample(table: Table, schedule: Torque, start, duration, motion: Motion, shar
         arc = jax.tree.map(lambda a: a[k], steps)
         width = arc.share[1] - arc.share[0]
         xi = jnp.clip((share - arc.share[0]) / jnp.where(width > 0, width, 1.0), 0.0, 1.0)
-        _, s, w = on_arc(arc, xi)
+        _, s, w = evaluate_dense(arc, xi)
         over = share > motion.share[motion.count] + 1e-12
         w = jnp.where(over, 0.0, w)
-        panel, at = powers(table, arc.piece, s)
-        forces = force(table, seen, duration, arc.piece, arc.row, share, s, w)
+        panel, at = locate_panel(table, arc.piece, s)
+        forces = contact_force(table, seen, duration, arc.piece, arc.row, share, s, w)
         cn, ct = by_contact(table, arc.piece, jnp.where(arc.held | over, jnp.nan, forces))
-        tau = torque_in(seen, interval(seen, share), share)  # a wait is one step over many intervals
-        z_dot = on_panel(table.velocity, panel, at) * w / duration
-        return s, on_panel(table.configuration, panel, at), z_dot, tau, cn, ct
+        tau = torque_at(seen, interval(seen, share), share)  # a wait is one step over many intervals
+        z_dot = evaluate(table.velocity, panel, at) * w / duration
+        return s, evaluate(table.configuration, panel, at), z_dot, tau, cn, ct
 
     return Trajectory(start + duration * shares, *jax.vmap(one)(shares))
 
@@ -79,7 +79,7 @@ def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
     (['0.00', '0.25', '0.50', '0.75', '1.00'], (5, 4))
     """
     require_positive(samples=samples)
-    found, schedule, rows = [], padded(result.torque), rounded(samples, SAMPLED)
+    found, schedule, rows = [], pad_schedule(result.torque), round_up(samples, DEFAULT_SAMPLES)
     for phase in result.phases:
         if int(phase.traced.table.status) != Status.OK:
             break
@@ -88,7 +88,7 @@ def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
         shares = np.full(rows, stop)
         shares[:samples] = np.linspace(0.0, stop, samples)
         outcome = phase.outcome
-        course = sample(phase.traced.table, schedule, outcome.start, outcome.duration, outcome.motion, shares)
+        course = sample_phase(phase.traced.table, schedule, outcome.start, outcome.duration, outcome.motion, shares)
         found.append(jax.tree.map(lambda a: a[:samples], jax.device_get(course)))
         if phase.status is not Status.OK:
             break

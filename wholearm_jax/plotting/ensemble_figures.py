@@ -10,15 +10,15 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from wholearm_jax.core.status import Status
-from wholearm_jax.ensembles.summary import Survey
+from wholearm_jax.ensembles.summary import EnsembleSummary
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
 from wholearm_jax.plotting.plan_figures import INK
 
 _HOLDS, _FATES = "#009E73", ("#D55E00", "#E69F00", "#56B4E9", "#CC79A7", "#8B6914", "#999999")  # of scenes in a survey
 
 
-def draw_survey(
-    told: Survey,
+def draw_ensemble(
+    told: EnsembleSummary,
     influence: dict[str, float] | None = None,
     parameters: Sequence[tuple[str, np.ndarray]] = (),
     axes: Sequence[Axes] | None = None,
@@ -39,7 +39,7 @@ def draw_survey(
     return chosen
 
 
-def _draw_margins(told: Survey, ax: Axes) -> None:
+def _draw_margins(told: EnsembleSummary, ax: Axes) -> None:
     finite = np.isfinite(told.margins)
     found = [status for status in Status if np.any(told.statuses[finite] == status)]
     groups = [told.margins[finite & (told.statuses == status)] for status in found]
@@ -69,7 +69,7 @@ def _draw_influence(influence: dict[str, float], ax: Axes, most: int = 8) -> Non
     ax.spines[["top", "right", "left"]].set_visible(False)
 
 
-def _draw_map(told: Survey, parameters: Sequence[tuple[str, np.ndarray]], ax: Axes) -> None:
+def _draw_map(told: EnsembleSummary, parameters: Sequence[tuple[str, np.ndarray]], ax: Axes) -> None:
     """The mean margin in squares of two dozen scenes on average, but no more than 40 a side."""
     (across, x), (up, y) = parameters
     finite = np.isfinite(told.margins)

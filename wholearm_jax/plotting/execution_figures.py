@@ -13,7 +13,7 @@ from matplotlib.animation import FuncAnimation
 from matplotlib.axes import Axes
 from matplotlib.patches import Polygon as Patch
 
-from wholearm_jax.model.scene import body, pair_name
+from wholearm_jax.model.scene import rigid_body, feature_pair
 from wholearm_jax.plotting.palette import CONTACT_COLOURS, contact_styles
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
 from wholearm_jax.plotting.plan_figures import INK, PAGE, PALE, draw_pose, outline_at, over_time, pose_grid
@@ -106,7 +106,7 @@ def draw_deviation(execution: Execution, ax: Axes | None = None) -> Axes:
     course, expected = execution.course, execution.expected
     z = np.stack([np.interp(expected.time, course.time, course.z[:, k]) for k in range(3)], axis=1)
     off = z - expected.z[:, :3]
-    corners = np.asarray(body(execution.prediction.scene.object).vertices)
+    corners = np.asarray(rigid_body(execution.prediction.scene.object).vertices)
     rim = 1e3 * np.hypot(*corners.T).max() * np.abs(off[:, 2])
     ax.plot(expected.time, 1e3 * np.hypot(off[:, 0], off[:, 1]), color=COLOURS[0], label="centre of mass")
     ax.plot(expected.time, rim, color=COLOURS[1], ls="--", label="angle, at its rim")
@@ -146,7 +146,7 @@ def _spans(times, flags):
 
 def _colour(execution: Execution, name: str) -> str:
     """The colour of a contact of the plan."""
-    styles = contact_styles(map(pair_name, phase.contacts) for phase in execution.prediction.phases)
+    styles = contact_styles(map(feature_pair, phase.contacts) for phase in execution.prediction.phases)
     return CONTACT_COLOURS[styles[name][0]]
 
 

@@ -17,15 +17,15 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon as Patch
 from matplotlib.transforms import ScaledTranslation
 
-from wholearm_jax.core.atomic_files import write_whole
-from wholearm_jax.model.scene import Scene, body, parse_contact
+from wholearm_jax.core.atomic_files import write_atomically
+from wholearm_jax.model.scene import Scene, rigid_body, parse_contact
 from wholearm_jax.phases.result import Result
 from wholearm_jax.phases.sampling import trajectory
 from wholearm_jax.plotting.palette import CONTACT_COLOURS, DASHES, contact_styles
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
 
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
-    from wholearm_jax.optimisation.optimiser import Optimised
+    from wholearm_jax.optimisation.optimiser import OptimisationResult
 
 COLUMN, PAGE = 3.5, 7.16  # widths of one column and of two in the field's journals [inch]
 
@@ -79,7 +79,7 @@ def draw_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbe
     return ax
 
 
-def draw_ways(scene: Scene, z, ways, columns: int = 4, axes=None) -> np.ndarray:
+def draw_successors(scene: Scene, z, ways, columns: int = 4, axes=None) -> np.ndarray:
     """Where each way from configuration `z` leads: its end, with the start in grey; ways that can be traced only.
 
     Takes and returns an array of axes, at least one a way shown.
@@ -112,7 +112,7 @@ def _ghost(scene: Scene, z, ax: Axes) -> None:
 
 def outline_at(scene: Scene, z) -> np.ndarray:
     """The object's vertices `(n, 2)` in the world at configuration `z`."""
-    solid = body(scene.object)
+    solid = rigid_body(scene.object)
     corners = np.asarray(solid.vertices)[: int(solid.count)]
     c, s = np.cos(z[2]), np.sin(z[2])
     return corners @ np.array([[c, s], [-s, c]]) + z[:2]
@@ -222,7 +222,7 @@ def draw_result(result: Result, axes=None) -> np.ndarray:
     return axes
 
 
-def draw_history(found: Optimised, ax: Axes | None = None) -> Axes:
+def draw_history(found: OptimisationResult, ax: Axes | None = None) -> Axes:
     """The least force [N] over the steps of the descent, a curve for each start of each phase, and the bounds."""
     ax = ax or plt.gca()
     for phase in range(len(found.bounds)):
@@ -250,7 +250,7 @@ def save_figure(draw: Callable[[], Any], folder: Path, name: str) -> None:
         for kind, undated in (("png", {}), ("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
             buffer = io.BytesIO()
             figure.savefig(buffer, format=kind, dpi=250, bbox_inches="tight", metadata=undated)
-            write_whole(folder / f"{name}.{kind}", buffer.getvalue())
+            write_atomically(folder / f"{name}.{kind}", buffer.getvalue())
         plt.close(figure)
 
 

@@ -1,7 +1,7 @@
 """Reports: a result folder as one HTML page that needs nothing else: strip, animation with forces, plots, tables.
 
 What the page shows is read from the files that `result_file` writes, so that a report can be made at any time later.
-Only the places and normals of the contacts, along which forces are drawn, are computed again (`contacts`).
+Only the places and normals of the contacts, along which forces are drawn, are computed again (`contact_set`).
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from wholearm_jax.core.status import Status
 from wholearm_jax.files.results import TRAJECTORY_COLUMNS, read_torque
-from wholearm_jax.files.scene_toml import Positive, SceneError, explain, parse
-from wholearm_jax.model.contact_kinematics import contacts, frames
-from wholearm_jax.model.scene import COORDINATES, Scene, body, parse_contact
-from wholearm_jax.model.schedule import Torque
+from wholearm_jax.files.scene_toml import Positive, SceneError, explain_validation_error, parse
+from wholearm_jax.model.contact_kinematics import contact_set, contact_kinematics
+from wholearm_jax.model.scene import COORDINATES, Scene, rigid_body, parse_contact
+from wholearm_jax.model.schedule import TorqueSchedule
 from wholearm_jax.plotting.palette import (
     CONTACT_COLOURS,
     DARK_CONTACT_COLOURS,
@@ -75,14 +75,14 @@ class Written(NamedTuple):
 
     summary: dict[str, Any]
     scene: Scene
-    torque: Torque
+    torque: TorqueSchedule
     courses: dict[str, np.ndarray]
 
 
 def report(folder: str | Path) -> str:
     """The report of a result folder as one HTML page.
 
-    Reads `summary.json`, `trajectory.csv` and `torque.csv`. Raises `SceneError` naming the file and what is wrong.
+    Reads `summary.json`, `trajectory.csv` and `torque_schedule.csv`. Raises `SceneError` naming the file and what is wrong.
     """
     return render(read_result(folder))
 
@@ -122,7 +122,7 @@ def render(written: Written) -> str:
 
 def _drawn(written: Written) -> dict[str, Any]:
     """What the page draws, in SI units: the hand, the object about its centre of mass, and every phase sampled."""
-    scene, hand, solid = written.scene, written.scene.hand, body(written.scene.object)
+    scene, hand, solid = written.scene, written.scene.hand, rigid_body(written.scene.object)
     styles = contact_styles(row["contacts"] for row in written.summary["phases"])
     friction = np.asarray(scene.object.friction)
     end = max((float(rows[-1, 0]) for rows in written.courses.values()), default=0.0)
@@ -164,7 +164,7 @@ def _drawn(written: Written) -> dict[str, Any]:
     }
 
 
-def _until(torque: Torque, end: float) -> dict[str, Any]:
+def _until(torque: TorqueSchedule, end: float) -> dict[str, Any]:
     """The schedule's rows up to a time, and the torques then."""
     times, values = np.asarray(torque.times), np.asarray(torque.values)
     before = times <= end
@@ -174,12 +174,12 @@ def _until(torque: Torque, end: float) -> dict[str, Any]:
 
 def _places(scene: Scene, formation, z: np.ndarray) -> np.ndarray:
     """Where each contact is, and its normal into the object: `(samples, contacts, 4)`."""
-    several = contacts(body(scene.object), scene.hand, formation)
+    several = contact_set(rigid_body(scene.object), scene.hand, formation)
 
     @jax.jit
     @jax.vmap
     def at(z):
-        found = frames(several, z)
+        found = contact_kinematics(several, z)
         return jax.numpy.stack([z[0] + found.from_object[0], z[1] + found.from_object[1], *found.normal], axis=1)
 
     return np.asarray(at(z))[:, list(formation.normal_slots)]
@@ -203,7 +203,7 @@ def _read_summary(path: Path) -> dict[str, Any]:
     try:
         _Summary.model_validate(content)
     except ValidationError as error:
-        raise SceneError(f"{path}: {explain(error)}; it is not a summary that this library wrote") from None
+        raise SceneError(f"{path}: {explain_validation_error(error)}; it is not a summary that this library wrote") from None
     return content
 
 

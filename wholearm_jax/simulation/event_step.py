@@ -8,38 +8,38 @@ import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from wholearm_jax.core.arrays import digits
-from wholearm_jax.dynamics.path_dynamics import Table, combined, powers
-from wholearm_jax.model.schedule import Window, torque_in
-from wholearm_jax.simulation.integrator import Integration, solver_of
+from wholearm_jax.core.arrays import eps_power
+from wholearm_jax.dynamics.path_dynamics import PathDynamics, evaluate_dot, locate_panel
+from wholearm_jax.model.schedule import PhaseSchedule, torque_at
+from wholearm_jax.simulation.integrator import IntegratorOptions, solver_of
 
-LANDINGS = 40  # at most so many Newton steps, or halvings, to the place where a stage ends
+MAX_EVENT_ITERATIONS = 40  # at most so many Newton steps, or halvings, to the place where a stage ends
 
 
 @jax.jit
-def acceleration(table: Table, seen: Window, duration, piece, row, share, s, w):
+def path_acceleration(table: PathDynamics, seen: PhaseSchedule, duration, piece, row, share, s, w):
     """`dw/du` for forward travel in a piece and a torque interval."""
-    panel, xi = powers(table, piece, s)
+    panel, xi = locate_panel(table, piece, s)
     rest = jnp.stack([duration**2, w**2, duration * w])
-    terms = jnp.concatenate([rest, duration**2 * torque_in(seen, row, share)])
-    return combined(table.acceleration, panel, xi, terms)
+    terms = jnp.concatenate([rest, duration**2 * torque_at(seen, row, share)])
+    return evaluate_dot(table.acceleration, panel, xi, terms)
 
 
 @jax.jit
-def single_step(table, seen, duration, how: Integration, piece, row, share, y, length):
+def solver_step(table, seen, duration, how: IntegratorOptions, piece, row, share, y, length):
     """One step of the solver from `y = (s, w)` at a share of the phase, within a piece and a torque interval."""
     solver = solver_of(how)
 
     def field(u, y, args):
         table, seen, duration = args
-        return jnp.stack([y[1], acceleration(table, seen, duration, piece, row, u, y[0], y[1])])
+        return jnp.stack([y[1], path_acceleration(table, seen, duration, piece, row, u, y[0], y[1])])
 
     term, args = dfx.ODETerm(field), (table, seen, duration)
     state = solver.init(term, share, share + length, y, args)
     return solver.step(term, share, share + length, y, args, state, made_jump=True)[0]
 
 
-def land(table, seen, duration, how, piece, row, node, end, goal, floor, wanted):
+def step_to_event(table, seen, duration, how, piece, row, node, end, goal, floor, wanted):
     """Retake the last step from `node` with the length that lands on `s = goal` or on `w = 0`, whichever comes first.
 
     Returns where it lands, whether on the goal, and whether it went astray: no length within the step lands there.
@@ -49,11 +49,11 @@ def land(table, seen, duration, how, piece, row, node, end, goal, floor, wanted)
 
     def field(share, y, args):
         table, seen, duration = args
-        return jnp.stack([y[1], acceleration(table, seen, duration, piece, row, share, y[0], y[1])])
+        return jnp.stack([y[1], path_acceleration(table, seen, duration, piece, row, share, y[0], y[1])])
 
     def step(share, length, y, args):
         table, seen, duration = args
-        return single_step(table, seen, duration, how, piece, row, share, y, length)
+        return solver_step(table, seen, duration, how, piece, row, share, y, length)
 
     args = (table, seen, duration)
     fixed = stop_gradient((share, jnp.stack([s, w]), args, longest))
@@ -78,10 +78,10 @@ def land(table, seen, duration, how, piece, row, node, end, goal, floor, wanted)
 
     def going(bracket):
         *_, moved, count = bracket
-        return (moved > enough) & (count < LANDINGS)
+        return (moved > enough) & (count < MAX_EVENT_ITERATIONS)
 
     # Half of the digits and some: the last step below, which carries derivatives, brings the others.
-    enough = digits(s, 5 / 8) * fixed[3]
+    enough = eps_power(s, 5 / 8) * fixed[3]
     begin = (jnp.zeros_like(fixed[3]), fixed[3], fixed[3] / 2, fixed[3], jnp.asarray(0, int))
     length = jax.lax.while_loop(going, narrow, begin)[2]
     y = step(share, length, jnp.stack([s, w]), args)

@@ -18,16 +18,16 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.arrays import given
-from wholearm_jax.core.lookup import pick
-from wholearm_jax.model.schedule import Window, interval, rounded
+from wholearm_jax.core.arrays import as_strong_array
+from wholearm_jax.core.lookup import take_row
+from wholearm_jax.model.schedule import PhaseSchedule, interval, round_up
 
-Loop = Literal["lax", "bounded"]
-LOOPS: dict[str, Loop] = {"none": "lax", "forward": "lax", "reverse": "bounded", "both": "bounded"}
+LoopKind = Literal["lax", "bounded"]
+LOOP_KIND: dict[str, LoopKind] = {"none": "lax", "forward": "lax", "reverse": "bounded", "both": "bounded"}
 """Equinox's loop that serves each adjoint: what is `bounded` passes reverse mode, too."""
 
 
-class Integration(eqx.Module):
+class IntegratorOptions(eqx.Module):
     """How to integrate: diffrax solver, error `tolerance` a step (relative, of the wire's scale), limits, adjoint.
 
     `steps` says that the torque schedule has steps inside the phase. `adjoint` says what the solve will be
@@ -46,18 +46,18 @@ class Integration(eqx.Module):
     adjoint: str = eqx.field(static=True, default="none")
 
 
-def tolerance_as_data(how: Integration, dtype) -> Integration:
+def tolerance_as_data(how: IntegratorOptions, dtype) -> IntegratorOptions:
     """The same integration, with a tolerance that is an array: all tolerances share a program."""
-    tolerance = given(how.tolerance, dtype)
+    tolerance = as_strong_array(how.tolerance, dtype)
     return how if tolerance is how.tolerance else replace(how, tolerance=tolerance)
 
 
-def with_room(how: Integration, rows: int) -> Integration:
+def with_step_capacity(how: IntegratorOptions, rows: int) -> IntegratorOptions:
     """The same integration with room for a step at each of so many rows of a schedule, and for as many more."""
-    return replace(how, max_steps=rounded(2 * max(rows, 1), how.max_steps))
+    return replace(how, max_steps=round_up(2 * max(rows, 1), how.max_steps))
 
 
-class Steps(NamedTuple):
+class AcceptedSteps(NamedTuple):
     """Accepted steps, `count` of them: when each ends, in which interval of the schedule it lies, the state at its end.
 
     `passed` says that the last one came past what was to stop it, `complete` that steps did not run out before.
@@ -71,8 +71,8 @@ class Steps(NamedTuple):
     complete: Bool[Array, ""]
 
 
-class _Step(NamedTuple):
-    """The next step that `found` tries; `size` is how long it would be if no knot cut it."""
+class _IntegratorState(NamedTuple):
+    """The next step that `integrate_adaptive` tries; `size` is how long it would be if no knot cut it."""
 
     begin: Float[Array, ""]
     end: Float[Array, ""]
@@ -83,10 +83,10 @@ class _Step(NamedTuple):
     reused: tuple
     control: tuple
     tries: Int[Array, ""]
-    steps: Steps
+    steps: AcceptedSteps
 
 
-class Stop(NamedTuple):
+class TerminalEvent(NamedTuple):
     """What ends steps: `past(y)` says that a state is beyond, `between(y, after, rates, width)` that a step may have
     been and come back; `rates` are `dy/du` at its ends times its `width`."""
 
@@ -94,7 +94,7 @@ class Stop(NamedTuple):
     between: Callable
 
 
-def found(field: Callable, seen: Window, how: Integration, begin, final, y, stop: Stop, way: Float[Array, ""]) -> Steps:
+def integrate_adaptive(field: Callable, seen: PhaseSchedule, how: IntegratorOptions, begin, final, y, stop: TerminalEvent, way: Float[Array, ""]) -> AcceptedSteps:
     """Steps by their error from `begin` to `final`, or to the first that comes past its `stop`; each ends at a knot at
     most.
 
@@ -110,15 +110,15 @@ def found(field: Callable, seen: Window, how: Integration, begin, final, y, stop
 
     def cut(begin, size, number):
         """Where a step ends: on the interval's end, rather than next to it or beyond."""
-        knot = jnp.minimum(jnp.where(number < seen.last, pick(seen.share, number + 1), final), final)
+        knot = jnp.minimum(jnp.where(number < seen.last, take_row(seen.share, number + 1), final), final)
         return jnp.where(begin + size > knot - 100 * eps, knot, begin + size)
 
-    def attempt(at: _Step) -> _Step:
+    def attempt(at: _IntegratorState) -> _IntegratorState:
         y, miss, dense, reused, _ = solver.step(term, at.begin, at.end, at.y, at.row, at.reused, at.jumped)
         error = jnp.asarray(miss)
         error = jnp.where(jnp.isnan(error), jnp.inf, error)
         kept, *span, _, control, _ = errors.adapt_step_size(at.begin, at.end, at.y, y, None, error, order, at.control)
-        halved = kept & stop.between(at.y, y, _rates(solver, field, at, y, dense), at.end - at.begin)
+        halved = kept & stop.between(at.y, y, _end_rates(solver, field, at, y, dense), at.end - at.begin)
         kept = kept & ~halved
         shorter = at.begin, (at.begin + at.end) / 2, at.control
         begin, end, control = jax.tree.map(lambda a, b: jnp.where(halved, a, b), shorter, (*span, control))
@@ -135,15 +135,15 @@ def found(field: Callable, seen: Window, how: Integration, begin, final, y, stop
         )
         y, reused = jax.tree.map(lambda new, old: jnp.where(kept, new, old), (y, reused), (at.y, at.reused))
         jumped = jnp.where(kept, row != at.row, at.jumped) if how.steps else False
-        return _Step(begin, cut(begin, size, row), size, row, y, jumped, reused, control, at.tries + 1, steps)
+        return _IntegratorState(begin, cut(begin, size, row), size, row, y, jumped, reused, control, at.tries + 1, steps)
 
-    def going(at: _Step):
+    def going(at: _IntegratorState):
         return (at.begin < final) & ~at.steps.passed & (at.tries < how.max_steps)
 
     half = jnp.where(y[1] > 0, way / jnp.where(y[1] > 0, 2 * y[1], 1.0), 1.0)
     size, row = jnp.clip(half, eps, 1 / 32), interval(seen, begin)
     end = cut(begin, size, row)
-    none = Steps(
+    none = AcceptedSteps(
         end=jnp.full(how.max_steps, begin),
         row=jnp.zeros(how.max_steps, int),
         y=jnp.broadcast_to(y, (how.max_steps, 2)),
@@ -154,12 +154,12 @@ def found(field: Callable, seen: Window, how: Integration, begin, final, y, stop
     reused = solver.init(term, begin, end, y, row)
     _, control = errors.init(term, begin, final, y, size, row, solver.func, order)
     jumped = jnp.asarray(False) if how.steps else False
-    start = _Step(begin, end, size, row, y, jumped, reused, control, jnp.asarray(0, int), none)
+    start = _IntegratorState(begin, end, size, row, y, jumped, reused, control, jnp.asarray(0, int), none)
     last = jax.lax.while_loop(going, attempt, start)
     return last.steps._replace(complete=(last.begin >= final) | last.steps.passed)
 
 
-def _rates(solver: dfx.AbstractSolver, field: Callable, at: _Step, y, dense):
+def _end_rates(solver: dfx.AbstractSolver, field: Callable, at: _IntegratorState, y, dense):
     """`dy/du` at a step's ends times its length, which most solvers know."""
     if isinstance(tableau := getattr(solver, "tableau", None), dfx.ButcherTableau) and tableau.fsal:
         return dense["k"][0], dense["k"][-1]
@@ -167,22 +167,22 @@ def _rates(solver: dfx.AbstractSolver, field: Callable, at: _Step, y, dense):
     return tuple((at.end - at.begin) * rate for rate in ends)
 
 
-def repeated(field: Callable, seen: Window, how: Integration, begin, final, y, steps: Steps) -> Steps:
-    """Steps that were `found`, taken again; those that end on a knot move with it."""
+def replay_steps(field: Callable, seen: PhaseSchedule, how: IntegratorOptions, begin, final, y, steps: AcceptedSteps) -> AcceptedSteps:
+    """Steps that were `integrate_adaptive`, taken again; those that end on a knot move with it."""
     count, row = steps.count, steps.row
-    ends = _ends(seen, steps, final)
+    ends = _step_ends(seen, steps, final)
     # A batch goes on until its last member has finished: the others take steps of no length.
     ends = jnp.where(jnp.arange(how.max_steps) < count, ends, ends[jnp.maximum(count - 1, 0)])
     ends = jnp.where(count > 0, ends, begin)
     begins = jnp.concatenate([begin[None], ends[:-1]])
-    kind = LOOPS[how.adjoint]
+    kind = LOOP_KIND[how.adjoint]
     solver, term = _with_stages(how.solver, kind), dfx.ODETerm(field)
     jumps = jnp.append(False, row[1:] != row[:-1])
 
     def step(at):
         k, y, reused, ys = at
-        jumped = pick(jumps, k) if how.steps else False
-        y, _, _, reused, _ = solver.step(term, pick(begins, k), pick(ends, k), y, pick(row, k), reused, jumped)
+        jumped = take_row(jumps, k) if how.steps else False
+        y, _, _, reused, _ = solver.step(term, take_row(begins, k), take_row(ends, k), y, take_row(row, k), reused, jumped)
         return k + 1, y, reused, ys.at[k].set(y)
 
     rows = jnp.zeros_like(steps.y)  # not `y`: what a row of a buffer holds before it is written keeps its derivative
@@ -193,33 +193,33 @@ def repeated(field: Callable, seen: Window, how: Integration, begin, final, y, s
     return steps._replace(end=ends, y=ys)
 
 
-def _ends(seen: Window, steps: Steps, final):
+def _step_ends(seen: PhaseSchedule, steps: AcceptedSteps, final):
     """When steps end: on a knot, or at a time of their own."""
     knot = seen.share[steps.row + 1]
     return jnp.where((steps.end == stop_gradient(knot)) & (steps.end < final), knot, stop_gradient(steps.end))
 
 
 @eqx.filter_custom_vjp
-def reversible(inputs, field_of: Callable, stop_of: Callable, how: Integration, final, limits, way) -> Steps:
-    """`found`, of `field_of(parameters, seen)` until `stop_of(limits)`, whose reverse mode goes back over its own
+def integrate_with_replay_adjoint(inputs, field_of: Callable, stop_of: Callable, how: IntegratorOptions, final, limits, way) -> AcceptedSteps:
+    """`integrate_adaptive`, of `field_of(parameters, seen)` until `stop_of(limits)`, whose reverse mode goes back over its own
     steps.
 
     `inputs` are `(parameters, seen, begin, y)`, what it can be differentiated by. Each step is computed once more on
     the way back, from where it began, and none on the way there.
     """
     parameters, seen, begin, y = inputs
-    return found(field_of(parameters, seen), seen, how, begin, final, y, stop_of(limits), way)
+    return integrate_adaptive(field_of(parameters, seen), seen, how, begin, final, y, stop_of(limits), way)
 
 
-@reversible.def_fwd
-def _forth(_, inputs, *others):
+@integrate_with_replay_adjoint.def_fwd
+def _replay_forward(_, inputs, *others):
     # Derivatives of a gradient would miss how the states between steps move.
-    steps = reversible(eqxi.nondifferentiable(inputs), *others)
+    steps = integrate_with_replay_adjoint(eqxi.nondifferentiable(inputs), *others)
     return steps, steps
 
 
-@reversible.def_bwd
-def _back(steps: Steps, gradient: Steps, perturbed, inputs, field_of, stop_of, how, final, limits, way):
+@integrate_with_replay_adjoint.def_bwd
+def _replay_backward(steps: AcceptedSteps, gradient: AcceptedSteps, perturbed, inputs, field_of, stop_of, how, final, limits, way):
     parameters, seen, begin, y = inputs
     moved, kept = eqx.partition((parameters, seen, begin), perturbed[:3])
     solver = solver_of(how)
@@ -231,16 +231,16 @@ def _back(steps: Steps, gradient: Steps, perturbed, inputs, field_of, stop_of, h
 
     def step(moved, y, k):
         parameters, seen, begin = eqx.combine(moved, kept)
-        ends = _ends(seen, steps, final)
-        begin = jnp.where(k > 0, pick(ends, jnp.maximum(k - 1, 0)), begin)
-        term, end, row = dfx.ODETerm(field_of(parameters, seen)), pick(ends, k), pick(steps.row, k)
+        ends = _step_ends(seen, steps, final)
+        begin = jnp.where(k > 0, take_row(ends, jnp.maximum(k - 1, 0)), begin)
+        term, end, row = dfx.ODETerm(field_of(parameters, seen)), take_row(ends, k), take_row(steps.row, k)
         reused = solver.init(term, begin, end, y, row)
         return end, solver.step(term, begin, end, y, row, reused, made_jump=False)[0]
 
     def before(at):
         k, onto, total = at
-        _, pull = jax.vjp(lambda moved, y: step(moved, y, k), moved, pick(ys, k))
-        share, onto = pull((pick(onto_end, k), onto + pick(onto_y, k)))
+        _, pull = jax.vjp(lambda moved, y: step(moved, y, k), moved, take_row(ys, k))
+        share, onto = pull((take_row(onto_end, k), onto + take_row(onto_y, k)))
         return k - 1, onto, jax.tree.map(jnp.add, total, share)
 
     none = jax.tree.map(jnp.zeros_like, moved)
@@ -249,10 +249,10 @@ def _back(steps: Steps, gradient: Steps, perturbed, inputs, field_of, stop_of, h
     return *total, onto
 
 
-def solver_of(how: Integration) -> dfx.AbstractSolver:
+def solver_of(how: IntegratorOptions) -> dfx.AbstractSolver:
     """The solver, with a loop over its stages that may be differentiated as `how` says."""
-    return _with_stages(how.solver, LOOPS[how.adjoint])
+    return _with_stages(how.solver, LOOP_KIND[how.adjoint])
 
 
-def _with_stages(solver: dfx.AbstractSolver, kind: Loop) -> dfx.AbstractSolver:
+def _with_stages(solver: dfx.AbstractSolver, kind: LoopKind) -> dfx.AbstractSolver:
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)

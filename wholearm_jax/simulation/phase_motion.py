@@ -5,7 +5,7 @@ tolerances mean the same for every size and duration:
 
     ds/du = w,    dw/du = T^2 (A0 + A3 tau1 + A4 tau2) + T A2 w + A1 w^2
 
-with the coefficients of `reduction.Table`. A phase is a sequence of smooth stages. Each stage is a run of steps
+with the coefficients of `reduction.PathDynamics`. A phase is a sequence of smooth stages. Each stage is a run of steps
 that end on the torque's knots; it stops at the first step that leaves the piece or turns the speed negative.
 That step is then taken again with the length that lands exactly on the piece's end, or on rest, so that the method
 keeps its order across slip reversals and the landing carries its own derivatives.
@@ -23,13 +23,13 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.lookup import pick
-from wholearm_jax.core.small_linalg import times
+from wholearm_jax.core.lookup import take_row
+from wholearm_jax.core.small_linalg import fused_matmul
 from wholearm_jax.core.status import Status
-from wholearm_jax.dynamics.path_dynamics import Table, on_panel, powers
-from wholearm_jax.model.schedule import Window, interval, torque_in
-from wholearm_jax.simulation.event_step import acceleration, land
-from wholearm_jax.simulation.integrator import Integration, Steps, Stop, found, repeated, reversible
+from wholearm_jax.dynamics.path_dynamics import PathDynamics, evaluate, locate_panel
+from wholearm_jax.model.schedule import PhaseSchedule, interval, torque_at
+from wholearm_jax.simulation.event_step import path_acceleration, step_to_event
+from wholearm_jax.simulation.integrator import IntegratorOptions, AcceptedSteps, TerminalEvent, integrate_adaptive, replay_steps, integrate_with_replay_adjoint
 
 
 class Motion(NamedTuple):
@@ -51,7 +51,7 @@ class Motion(NamedTuple):
     status: Int[Array, ""]
 
 
-class _State(NamedTuple):
+class _MotionState(NamedTuple):
     share: Float[Array, ""]
     s: Float[Array, ""]
     w: Float[Array, ""]
@@ -66,12 +66,12 @@ class _State(NamedTuple):
     held: Bool[Array, "steps"]
 
 
-def move(
-    table: Table,
-    seen: Window,
+def simulate_motion(
+    table: PathDynamics,
+    seen: PhaseSchedule,
     duration: Float[Array, ""],
     *,
-    how: Integration,
+    how: IntegratorOptions,
     s: Float[Array, ""] | None = None,
     speed: Float[Array, ""] | float = 0.0,
     free: bool | Bool[Array, ""] = False,
@@ -86,7 +86,7 @@ def move(
     begin = table.breaks[0] if s is None else jnp.asarray(s, dtype)
     w = jnp.asarray(speed, dtype) * duration
     first = jnp.stack([jnp.zeros((), dtype), begin, w])
-    state = _State(
+    state = _MotionState(
         share=first[0],
         s=begin,
         w=w,
@@ -106,7 +106,7 @@ def move(
         return _stage(table, seen, duration, how, free, state)
 
     if how.adjoint in ("none", "forward"):
-        state = _repeated(stage, state, how.stages)
+        state = _run_stages(stage, state, how.stages)
     else:  # reverse mode must know how often
 
         def once(state, _):
@@ -128,7 +128,7 @@ def move(
     )
 
 
-def _repeated(stage, state: _State, most: int) -> _State:
+def _run_stages(stage, state: _MotionState, most: int) -> _MotionState:
     """Stage after stage until all is done, at most so many."""
 
     def going(loop):
@@ -138,24 +138,24 @@ def _repeated(stage, state: _State, most: int) -> _State:
     return jax.lax.while_loop(going, lambda loop: (loop[0] + 1, stage(loop[1])), (jnp.asarray(0, int), state))[1]
 
 
-def _stage(table, seen, duration, how, free, state: _State) -> _State:
+def _stage(table, seen, duration, how, free, state: _MotionState) -> _MotionState:
     """Wait at rest if need be, then move until the piece ends, the object stops, or time is over."""
-    state, verdict, room = _wait(table, seen, how, free, state)
+    state, verdict, room = _dwell(table, seen, how, free, state)
     blocked = verdict != int(Status.OK)
     last = state.piece >= table.count - 1
-    goal = pick(table.breaks, state.piece + 1) + jnp.where(free & last, jnp.inf, 0.0)
+    goal = take_row(table.breaks, state.piece + 1) + jnp.where(free & last, jnp.inf, 0.0)
     floor = jnp.where(free, -jnp.inf, 0.0)
     final = jnp.where(blocked, state.share, 1.0)
 
     steps = _integrate(table, seen, duration, how, state, final, goal, floor)
     overshot = steps.passed
     last_step = jnp.maximum(steps.count - 1, 0)
-    last_time, row = jnp.where(overshot, pick(steps.end, last_step), 1.0), pick(steps.row, last_step)
-    state, complete = _recorded(state, steps, overshot, room)
+    last_time, row = jnp.where(overshot, take_row(steps.end, last_step), 1.0), take_row(steps.row, last_step)
+    state, complete = _record_steps(state, steps, overshot, room)
     node = state.share, state.s, state.w
-    landed = land(table, seen, duration, how, state.piece, row, node, last_time, goal, floor, overshot)
+    landed = step_to_event(table, seen, duration, how, state.piece, row, node, last_time, goal, floor, overshot)
     land_share, land_s, land_w, passed, astray = landed
-    state = _append(state, overshot, land_share, land_s, land_w, state.w, row, held=False)
+    state = _append_step(state, overshot, land_share, land_s, land_w, state.w, row, held=False)
     onward = passed & ~last
     factor = table.factor[jnp.minimum(state.piece + 1, table.factor.shape[0] - 1)]
     # `done` waits for the next stage where the object has come to rest: it may start again.
@@ -178,20 +178,20 @@ def _stage(table, seen, duration, how, free, state: _State) -> _State:
     )
 
 
-def _wait(table, seen, how, free, state: _State):
+def _dwell(table, seen, how, free, state: _MotionState):
     """Wait while friction holds an object that is at rest: the state then, what it does, and room in the record."""
     rest = (state.w <= 0) & ~free
-    share, verdict = _departure(table, seen, state)
+    share, verdict = _first_departure(table, seen, state)
     share = jnp.where(rest, share, state.share)
     verdict = jnp.where(rest, verdict, int(Status.OK))
     waited = rest & (share > state.share)
     room = how.max_steps - state.count - waited
     row = interval(seen, stop_gradient(state.share + share) / 2)
-    state = _append(state, waited, share, state.s, state.w, state.w, row, held=True)
+    state = _append_step(state, waited, share, state.s, state.w, state.w, row, held=True)
     return state._replace(share=share), verdict, room
 
 
-def _recorded(state: _State, steps: Steps, overshot, room):
+def _record_steps(state: _MotionState, steps: AcceptedSteps, overshot, room):
     """Record steps but the last one where it `overshot`: the state after them, whether the record holds them."""
     capacity = state.entry_w.shape[0]
     y0 = jnp.stack([state.s, state.w])
@@ -204,7 +204,7 @@ def _recorded(state: _State, steps: Steps, overshot, room):
     recorded = jnp.concatenate([steps.end[:, None], steps.y], axis=1)
     nodes = state.nodes.at[place].set(recorded, mode="drop")
     entered = jnp.concatenate([y0[1:], steps.y[:-1, 1]])
-    share, s, w = pick(nodes, start + kept)
+    share, s, w = take_row(nodes, start + kept)
     state = state._replace(
         share=share,
         s=s,
@@ -218,7 +218,7 @@ def _recorded(state: _State, steps: Steps, overshot, room):
     return state, complete
 
 
-def _integrate(table, seen, duration, how, state, final, goal, floor) -> Steps:
+def _integrate(table, seen, duration, how, state, final, goal, floor) -> AcceptedSteps:
     """Steps from the state to `final` or to the first that passes `goal` or falls below the speed `floor`."""
     limits, final = stop_gradient(((goal, floor), final))
     way = limits[0] - stop_gradient(state.s)
@@ -226,33 +226,33 @@ def _integrate(table, seen, duration, how, state, final, goal, floor) -> Steps:
     parameters = table, duration, state.piece
     begin, y = state.share, jnp.stack([state.s, state.w])
     if how.adjoint == "reverse":
-        return reversible((parameters, seen, begin, y), _field, _stop, how, final, (*limits, least), way)
+        return integrate_with_replay_adjoint((parameters, seen, begin, y), _field, _terminal_event, how, final, (*limits, least), way)
 
     def solve(method, parameters, seen, begin, y, *more):
         return method(_field(parameters, seen), seen, how, begin, final, y, *more)
 
     inputs = parameters, seen, begin, y
     fixed = inputs if how.adjoint == "none" else stop_gradient(inputs)
-    steps = solve(found, *fixed, _stop((*limits, least)), way)
-    return steps if how.adjoint == "none" else solve(repeated, *inputs, steps)
+    steps = solve(integrate_adaptive, *fixed, _terminal_event((*limits, least)), way)
+    return steps if how.adjoint == "none" else solve(replay_steps, *inputs, steps)
 
 
-def _field(parameters, seen: Window):
+def _field(parameters, seen: PhaseSchedule):
     """`d(s, w)/du` in a piece, for `stepping`."""
     table, duration, piece = parameters
 
     def field(u, y, row):
-        return jnp.stack([y[1], acceleration(table, seen, duration, piece, row, u, y[0], y[1])])
+        return jnp.stack([y[1], path_acceleration(table, seen, duration, piece, row, u, y[0], y[1])])
 
     return field
 
 
-def _stop(limits) -> Stop:
+def _terminal_event(limits) -> TerminalEvent:
     """A state past the goal or below the floor, a speed; and a step on which the object may have come to rest and set
     out again: one of the coefficients of `ds/du` by Bernstein's polynomials is negative, between which it stays.
 
     Those of the quartic with the right speeds and accelerations at both ends and the right way between them. Going back
-    by the `least` way, which the tolerance does not see, does not count.
+    by the `plan_margin` way, which the tolerance does not see, does not count.
     """
     goal, floor, least = limits
 
@@ -266,10 +266,10 @@ def _stop(limits) -> Stop:
         lowest = jnp.minimum(jnp.minimum(second, third), fourth)
         return jnp.isfinite(floor) & (after[1] >= floor) & (lowest < -least)
 
-    return Stop(past, between)
+    return TerminalEvent(past, between)
 
 
-def _append(state, wanted, share, s, w, entry_w, row, *, held):
+def _append_step(state, wanted, share, s, w, entry_w, row, *, held):
     """Add one step to the record where `wanted`."""
     capacity = state.entry_w.shape[0]
     place = jnp.where(wanted & (state.count < capacity), state.count + 1, capacity + 1)
@@ -283,25 +283,25 @@ def _append(state, wanted, share, s, w, entry_w, row, *, held):
     )
 
 
-def _departure(table, seen, state):
+def _first_departure(table, seen, state):
     """When an object at rest at `s` starts to move, and what it does: `ok`, `reversed`, `ambiguous` or `stuck`.
 
     The accelerations at rest are linear in the torque, hence piecewise linear in time: their first signs are exact.
     """
-    panel, xi = powers(table, state.piece, state.s)
-    ahead = on_panel(table.acceleration, panel, xi)[jnp.array([0, 3, 4])]
-    behind = -on_panel(table.backward, panel, xi)
+    panel, xi = locate_panel(table, state.piece, state.s)
+    ahead = evaluate(table.acceleration, panel, xi)[jnp.array([0, 3, 4])]
+    behind = -evaluate(table.backward, panel, xi)
     rows = jnp.arange(seen.slope.shape[0])
     low = jnp.maximum(seen.share[:-1], state.share)
     high = jnp.minimum(seen.share[1:], 1.0)
     live = (rows >= seen.first) & (rows <= seen.last) & (high >= low)
     # Who starts as an interval ends starts with the next one: no step fits in between.
     inside = high - 8 * jnp.finfo(high.dtype).eps
-    tau_low = jax.vmap(torque_in, (None, 0, 0))(seen, rows, low)
+    tau_low = jax.vmap(torque_at, (None, 0, 0))(seen, rows, low)
 
     def first(pull):
-        value = pull[0] + times(tau_low, pull[1:])
-        rate = times(seen.slope, pull[1:])
+        value = pull[0] + fused_matmul(tau_low, pull[1:])
+        rate = fused_matmul(seen.slope, pull[1:])
         root = low - value / jnp.where(rate > 0, rate, 1.0)
         at = jnp.where(value > 0, low, jnp.where((rate > 0) & (root < inside), root, jnp.inf))
         at = jnp.where(live, at, jnp.inf)

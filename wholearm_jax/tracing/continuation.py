@@ -2,7 +2,7 @@ r"""March: follow the curve `z(s)` of a formation in short steps until something
 
 Each step predicts the next node by the cubic through the last two and their tangents, and corrects it by Newton's
 method on the C-functions in the plane `u . z = s`, `u` being the chart's direction. What is seen on the way: what ends
-the wire (`watch`), slips and joint speeds (each reversal is a kink), and the sign of `det [G; x]`, which changes where
+the wire (`rest_margin`), slips and joint speeds (each reversal is a kink), and the sign of `det [G; x]`, which changes where
 two wires meet.
 
 Derivation: section 3 of `docs/derivation.md`.
@@ -15,33 +15,33 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.arrays import digits
-from wholearm_jax.core.lookup import put
-from wholearm_jax.core.small_linalg import crossed, inverse, times
+from wholearm_jax.core.arrays import eps_power
+from wholearm_jax.core.lookup import set_row
+from wholearm_jax.core.small_linalg import null_vector, inverse_and_determinant, fused_matmul
 from wholearm_jax.core.status import Status
-from wholearm_jax.model.contact_kinematics import constraint_rows, constraints, slips
-from wholearm_jax.model.mechanics import System
-from wholearm_jax.model.scene import Heading
-from wholearm_jax.tracing.events import Watch, Watched, crossings, watch_of
+from wholearm_jax.model.contact_kinematics import constraint_jacobian, constraints, slip_velocity
+from wholearm_jax.model.mechanics import ScaledMechanics
+from wholearm_jax.model.scene import PathTarget
+from wholearm_jax.tracing.events import EventFunctions, EventValues, detect_events, event_functions
 
-LONGEST, SHORTEST = 0.06, 2e-3  # march steps, and the step at which an end counts as bracketed
-CHARTS = 8  # directions that a wire may be charted by, one after the other
+MAX_CONTINUATION_STEP, BRACKET_STEP = 0.06, 2e-3  # march steps, and the step at which an end counts as bracketed
+MAX_CHARTS = 8  # directions that a wire may be charted by, one after the other
 
 
-def oriented_tangent(system: System, z, hint):
+def oriented_tangent(system: ScaledMechanics, z, hint):
     """The unit tangent `x` on the side of `hint`, and `det [G; x]`: the product of singular values, which changes sign
     where wires meet."""
-    across = crossed(constraint_rows(system.contacts, z))
+    across = null_vector(constraint_jacobian(system.contacts, z))
     size = jnp.sqrt((across**2).sum()) * jnp.where(across @ hint < 0, -1.0, 1.0)
     return across / size, size
 
 
-def speeds_of(system: System, z, x):
+def reversal_functions(system: ScaledMechanics, z, x):
     """What reverses at kinks: the slips of the contacts and the joints' speeds."""
-    return jnp.concatenate([slips(system.contacts, z, x), x[3:]])
+    return jnp.concatenate([slip_velocity(system.contacts, z, x), x[3:]])
 
 
-def signs_of(values, tolerance):
+def sign_with_deadband(values, tolerance):
     """Signs, 0 for what is no larger than `tolerance`."""
     return jnp.where(jnp.abs(values) > tolerance, jnp.sign(values), 0.0)
 
@@ -50,7 +50,7 @@ class Node(NamedTuple):
     """A place on the way: `z`, its tangent `x`, where along the wire, and the number of the chart that led to it.
 
     `orientation` is `det [G; x]`; `flips` says what reverses or turns on the way to it from the node before
-    (`speeds_of`, then the chart), at what `share` of that way.
+    (`reversal_functions`, then the chart), at what `share` of that way.
     """
 
     z: Float[Array, "*nodes 5"]
@@ -70,11 +70,11 @@ class Chart(NamedTuple):
     anchor_s: Float[Array, "*charts"]
 
 
-class March(NamedTuple):
+class TracedCurve(NamedTuple):
     """Nodes along the wire: `n` of them, in charts of which each has its number; the last is where the end was
     bracketed. Rows beyond `n` have an infinite `s`.
 
-    `end` is the row of what is `Watched` that ends the wire (-1: none), about at `end_z`.
+    `end` is the row of what is `EventValues` that ends the wire (-1: none), about at `end_z`.
     """
 
     n: Int[Array, ""]
@@ -85,13 +85,13 @@ class March(NamedTuple):
     status: Int[Array, ""]
 
 
-class _Way(NamedTuple):
+class _ContinuationState(NamedTuple):
     """A march on its way, its `nodes` and `charts` so far with one row more, for what is not kept.
 
     `last` is the last node within the wire, `earlier` the one before it, `chart` the last one; kept beside the rows,
     which are only ever written: what is read as well would be copied in each step. `near` says that the last try came
     past the end of the wire: the next one stops just short of it, and the one after that goes over it. `speeds` are
-    those of the last node, `sense` the signs that they had last. `before` is what is watched at the last node, `beyond`
+    those of the last node, `sense` the signs that they had last. `before` is what is watched at the last node, `limit_violations`
     at the last one tried.
     """
 
@@ -106,35 +106,35 @@ class _Way(NamedTuple):
     charts: Chart
     speeds: Float[Array, "6"]
     sense: Float[Array, "6"]
-    before: Watched
-    beyond: Watched
+    before: EventValues
+    beyond: EventValues
     tried: Node
     status: Int[Array, ""]
     done: Bool[Array, ""]
 
 
-def march(system: System, heading: Heading, z: Float[Array, "5"], x: Float[Array, "5"], capacity: int) -> March:
+def trace_curve(system: ScaledMechanics, heading: PathTarget, z: Float[Array, "5"], x: Float[Array, "5"], capacity: int) -> TracedCurve:
     """Follow a wire from `z` along its unit tangent `x` to its end: `max_steps` if `capacity` nodes do not reach it."""
-    watch, tolerance = watch_of(system, heading, z), digits(z, 5 / 8)
+    watch, tolerance = event_functions(system, heading, z), eps_power(z, 5 / 8)
 
-    def step(way: _Way) -> _Way:
+    def step(way: _ContinuationState) -> _ContinuationState:
         return _step(system, watch, tolerance, capacity, way)
 
-    way = jax.lax.while_loop(lambda way: ~way.done, step, _begin(z, x, watch, capacity))
-    return _ended(watch, way, tolerance)
+    way = jax.lax.while_loop(lambda way: ~way.done, step, _initial_state(z, x, watch, capacity))
+    return _bracket_end(watch, way, tolerance)
 
 
-def _begin(z, x, watch: Watch, capacity: int) -> _Way:
+def _initial_state(z, x, watch: EventFunctions, capacity: int) -> _ContinuationState:
     """A march that has no node yet. Its first step has no length: it looks about at the start."""
 
     def rows(number, row):
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (number, *a.shape)), row)
 
     zero, whole, none, still = jnp.zeros((), z.dtype), jnp.asarray(0, int), jnp.zeros(6, z.dtype), 0 * watch.shift
-    nothing = Watched(still - jnp.inf, still, still)
+    nothing = EventValues(still - jnp.inf, still, still)
     start = Node(z, x, zero, jnp.zeros(7, bool), jnp.zeros(7, z.dtype), zero, whole)
     chart = Chart(x, z, zero)
-    return _Way(
+    return _ContinuationState(
         n=whole,
         step=zero,
         near=jnp.asarray(False),
@@ -142,8 +142,8 @@ def _begin(z, x, watch: Watch, capacity: int) -> _Way:
         earlier=start,
         number=whole,
         chart=chart,
-        nodes=put(rows(capacity + 1, start._replace(s=zero + jnp.inf)), whole, start),
-        charts=rows(CHARTS + 1, chart),
+        nodes=set_row(rows(capacity + 1, start._replace(s=zero + jnp.inf)), whole, start),
+        charts=rows(MAX_CHARTS + 1, chart),
         speeds=none,
         sense=none,
         before=nothing,
@@ -154,49 +154,49 @@ def _begin(z, x, watch: Watch, capacity: int) -> _Way:
     )
 
 
-def _step(system: System, watch: Watch, tolerance, capacity: int, way: _Way) -> _Way:
+def _step(system: ScaledMechanics, watch: EventFunctions, tolerance, capacity: int, way: _ContinuationState) -> _ContinuationState:
     """Try one step: keep its node, take a shorter one, or find that the wire ends within the shortest."""
     last, u = way.last, way.chart.direction
     height = u @ last.z + way.step
-    z, moved, inverted, determinant = correct(system, u, _predicted(way), height, 4, tolerance)
+    z, moved, inverted, determinant = newton_corrector(system, u, _hermite_predictor(way), height, 4, tolerance)
     size = jnp.sqrt((inverted[:, 4] ** 2).sum())
     x, orientation = inverted[:, 4] / size, determinant * size  # u = x / size + what the rows of G span
     watched = watch.at(z, x / (u @ x))
     good = (moved < tolerance) & (x @ last.x > 0.98) & jnp.all(jnp.isfinite(x))
-    crossed, where = crossings(watch, way.before, watched, way.step, tolerance)
+    crossed, where = detect_events(watch, way.before, watched, way.step, tolerance)
     ends = good & jnp.any(crossed)
-    bracketed = ends & (way.step <= SHORTEST)
+    bracketed = ends & (way.step <= BRACKET_STEP)
     accept = good & ~jnp.any(crossed)
     turn = accept & (u @ x < 0.6)
     number = way.number + turn
-    speeds = speeds_of(system, z, x)
-    sign = signs_of(speeds, tolerance)
+    speeds = reversal_functions(system, z, x)
+    sign = sign_with_deadband(speeds, tolerance)
     flips = sign * way.sense < 0
     share = jnp.where(flips, jnp.clip(way.speeds / jnp.where(flips, way.speeds - speeds, 1.0), 0.0, 1.0), 0.0)
     flips, share = jnp.append(flips, way.number != last.chart), jnp.append(share, 0.0)
     tried = Node(z, x, last.s + way.step, flips, share, orientation, way.number)
     chart = Chart(x, z, tried.s)
-    before_end = way.step * jnp.where(crossed, where, 1.0).min() - SHORTEST / 2
-    before_end = jnp.maximum(jnp.where(way.near, way.step / 4, before_end), SHORTEST)
+    before_end = way.step * jnp.where(crossed, where, 1.0).min() - BRACKET_STEP / 2
+    before_end = jnp.maximum(jnp.where(way.near, way.step / 4, before_end), BRACKET_STEP)
     shorter = jnp.where(ends, before_end, way.step / 2)
-    longer = jnp.where(way.n > 0, jnp.minimum(way.step * 1.5, LONGEST), LONGEST)
+    longer = jnp.where(way.n > 0, jnp.minimum(way.step * 1.5, MAX_CONTINUATION_STEP), MAX_CONTINUATION_STEP)
     lost = ~good & (way.step < 1e-6)
-    full = (way.n + 1 >= capacity) | (number >= CHARTS)
+    full = (way.n + 1 >= capacity) | (number >= MAX_CHARTS)
     in_chart = watched._replace(rates=watched.rates * jnp.where(turn, u @ x, 1.0))
 
     def kept(wanted, new, old):
         return jax.tree.map(lambda a, b: jnp.where(wanted, a, b), new, old)
 
-    return _Way(
+    return _ContinuationState(
         n=way.n + (accept | bracketed),
-        step=jnp.where(accept, jnp.where(way.near, SHORTEST, longer), shorter),
+        step=jnp.where(accept, jnp.where(way.near, BRACKET_STEP, longer), shorter),
         near=ends,
         last=kept(accept, tried, last),
         earlier=kept(accept, last, way.earlier),
         number=number,
         chart=kept(turn, chart, way.chart),
-        nodes=put(way.nodes, jnp.where(accept | bracketed, way.n, capacity), tried),
-        charts=put(way.charts, jnp.where(turn, number, CHARTS), chart),
+        nodes=set_row(way.nodes, jnp.where(accept | bracketed, way.n, capacity), tried),
+        charts=set_row(way.charts, jnp.where(turn, number, MAX_CHARTS), chart),
         speeds=jnp.where(accept, speeds, way.speeds),
         sense=jnp.where(accept & (sign != 0), sign, way.sense),
         before=kept(accept, in_chart, way.before),
@@ -207,7 +207,7 @@ def _step(system: System, watch: Watch, tolerance, capacity: int, way: _Way) -> 
     )
 
 
-def _predicted(way: _Way):
+def _hermite_predictor(way: _ContinuationState):
     """The next node, by the cubic through the last two nodes and their tangents; the first by its tangent alone."""
     u, last, before = way.chart.direction, way.last, way.earlier
     slope, slope_before = last.x / (u @ last.x), before.x / (u @ before.x)
@@ -218,15 +218,15 @@ def _predicted(way: _Way):
     return last.z + way.step * (slope + bend * t)
 
 
-def _ended(watch: Watch, way: _Way, tolerance) -> March:
+def _bracket_end(watch: EventFunctions, way: _ContinuationState, tolerance) -> TracedCurve:
     """What ends the wire first between the last node within it and the last that was tried, and about where."""
     last, tried = way.last, way.tried
     step = jnp.where(way.status == 0, tried.s - last.s, 1.0)
-    crossed, where = crossings(watch, way.before, way.beyond, step, tolerance)
+    crossed, where = detect_events(watch, way.before, way.beyond, step, tolerance)
     first = jnp.argmin(jnp.where(crossed, where, jnp.inf))
     found = (way.status == 0) & jnp.any(crossed)
     start = way.nodes.z[0]
-    return March(
+    return TracedCurve(
         n=way.n,
         nodes=jax.tree.map(lambda rows: rows[:-1], way.nodes),
         charts=jax.tree.map(lambda rows: rows[:-1], way.charts),
@@ -236,7 +236,7 @@ def _ended(watch: Watch, way: _Way, tolerance) -> March:
     )
 
 
-def correct(system: System, u, z, height, steps: int, enough: ArrayLike = 0.0):
+def newton_corrector(system: ScaledMechanics, u, z, height, steps: int, enough: ArrayLike = 0.0):
     """Newton in the chart, until a step is no larger than `enough`: the place of the wire on the plane `u.z = height`.
 
     Beside it the last step's size, and `[G; u]^-1` and its determinant before that step.
@@ -244,9 +244,9 @@ def correct(system: System, u, z, height, steps: int, enough: ArrayLike = 0.0):
 
     def once(state):
         z, count, *_ = state
-        inverted, determinant = inverse(jnp.concatenate([constraint_rows(system.contacts, z), u[None]]))
+        inverted, determinant = inverse_and_determinant(jnp.concatenate([constraint_jacobian(system.contacts, z), u[None]]))
         left = jnp.concatenate([constraints(system.contacts, z), (u @ z - height)[None]])
-        move = times(inverted, left)
+        move = fused_matmul(inverted, left)
         return z - move, count + 1, jnp.abs(move).max(), inverted, determinant
 
     def going(state):

@@ -17,12 +17,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.model.contact_kinematics import Contacts, along_rates, frames, gap_rates
-from wholearm_jax.model.mechanics import System
-from wholearm_jax.model.scene import Heading
+from wholearm_jax.model.contact_kinematics import ContactSet, feature_velocity, contact_kinematics, gap_velocity
+from wholearm_jax.model.mechanics import ScaledMechanics
+from wholearm_jax.model.scene import PathTarget
 
 
-class Watched(NamedTuple):
+class EventValues(NamedTuple):
     """Values that stay positive on a wire, their rates `d/ds`, and places along features."""
 
     values: Float[Array, "rows"]
@@ -30,15 +30,15 @@ class Watched(NamedTuple):
     along: Float[Array, "rows"]
 
 
-class Watch(NamedTuple):
-    """What is watched: all pairs that may touch (`System.candidates`), room before and behind each contact on its
+class EventFunctions(NamedTuple):
+    """What is watched: all pairs that may touch (`ScaledMechanics.candidates`), room before and behind each contact on its
     feature, and a coordinate's limit.
 
     `gap`, `along`, `limit` and `shift` are the weights of a row's value. A pair ends the wire within `[lower, upper]`
     of its feature, and if it `counts`; `behind` marks vertices that may lie behind a link.
     """
 
-    contacts: Contacts
+    contacts: ContactSet
     gap: Float[Array, "rows"]
     along: Float[Array, "rows"]
     limit: Float[Array, "rows"]
@@ -49,19 +49,19 @@ class Watch(NamedTuple):
     counts: Bool[Array, "rows"]
     behind: Bool[Array, "rows"]
 
-    def at(self, z: Float[Array, "5"], slope: Float[Array, "5"]) -> Watched:
+    def at(self, z: Float[Array, "5"], slope: Float[Array, "5"]) -> EventValues:
         """What is watched at a place of the wire, where `z` changes by `slope` a unit of `s`."""
-        here = frames(self.contacts, z)
-        return Watched(
+        here = contact_kinematics(self.contacts, z)
+        return EventValues(
             values=self.gap * here.gap + self.along * here.along + self.limit * z[self.coordinate] + self.shift,
-            rates=self.gap * gap_rates(self.contacts, z, slope)
-            + self.along * along_rates(self.contacts, z, slope)
+            rates=self.gap * gap_velocity(self.contacts, z, slope)
+            + self.along * feature_velocity(self.contacts, z, slope)
             + self.limit * slope[self.coordinate],
             along=here.along,
         )
 
 
-def watch_of(system: System, heading: Heading, z: Float[Array, "5"]) -> Watch:
+def event_functions(system: ScaledMechanics, heading: PathTarget, z: Float[Array, "5"]) -> EventFunctions:
     """What is watched on a formation's wire from `z` on."""
     pairs, held, until = system.candidates, system.contacts, heading.until_coordinate >= 0
     sense = jnp.where(heading.until_value < z[heading.until_coordinate], -1.0, 1.0)
@@ -71,7 +71,7 @@ def watch_of(system: System, heading: Heading, z: Float[Array, "5"]) -> Watch:
     def rows(of_pairs, before, behind, of_limit):
         return jnp.concatenate([of_pairs, before, behind, jnp.reshape(of_limit, 1)])
 
-    return Watch(
+    return EventFunctions(
         contacts=jax.tree.map(lambda a, b: rows(a, b, b, b[0]), pairs, held),
         gap=rows(every, none, none, 0.0),
         along=rows(nothing, one, -one, 0.0),
@@ -85,7 +85,7 @@ def watch_of(system: System, heading: Heading, z: Float[Array, "5"]) -> Watch:
     )
 
 
-def crossings(watch: Watch, before: Watched, after: Watched, step, tolerance):
+def detect_events(watch: EventFunctions, before: EventValues, after: EventValues, step, tolerance):
     """Which watched values turn negative within a step (or dip below zero and return), and at what share of it.
 
     The share is a root of the cubic through values and rates: several things that end a wire within the shortest step

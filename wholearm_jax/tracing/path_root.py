@@ -21,13 +21,13 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core.arrays import digits
-from wholearm_jax.core.small_linalg import inverse, times
-from wholearm_jax.model.contact_kinematics import constraint_curvature, constraint_rates, constraint_rows, constraints
-from wholearm_jax.model.mechanics import System
+from wholearm_jax.core.arrays import eps_power
+from wholearm_jax.core.small_linalg import inverse_and_determinant, fused_matmul
+from wholearm_jax.model.contact_kinematics import constraint_second_derivative, constraint_velocity, constraint_jacobian, constraints
+from wholearm_jax.model.mechanics import ScaledMechanics
 
 
-class Root(NamedTuple):
+class PathRoot(NamedTuple):
     """A place and `x = dz/ds` there, the largest residual at the last iterate but one, and the number of steps."""
 
     z: Float[Array, "5"]
@@ -36,7 +36,7 @@ class Root(NamedTuple):
     steps: Int[Array, ""]
 
 
-class Along(NamedTuple):
+class LocalPath(NamedTuple):
     """A wire at one place, in the chart with direction `u`: `K`, `x = dz/ds`, `x' = d2z/ds2` and `det [G; u]`."""
 
     back: Float[Array, "5 slots"]
@@ -45,23 +45,23 @@ class Along(NamedTuple):
     determinant: Float[Array, ""]
 
 
-def along_wire(system: System, z: Float[Array, "5"], u: Float[Array, "5"]) -> Along:
+def path_derivatives(system: ScaledMechanics, z: Float[Array, "5"], u: Float[Array, "5"]) -> LocalPath:
     """What a wire does at `z`: `G x = 0`, `u.x = 1`, `G x' = -x^T H x`, `u.x' = 0`."""
-    inverted, determinant = inverse(jnp.concatenate([constraint_rows(system.contacts, z), u[None]]))
+    inverted, determinant = inverse_and_determinant(jnp.concatenate([constraint_jacobian(system.contacts, z), u[None]]))
     back, x = inverted[:, :4], inverted[:, 4]
-    return Along(back, x, -times(back, constraint_curvature(system.contacts, z, x)), determinant)
+    return LocalPath(back, x, -fused_matmul(back, constraint_second_derivative(system.contacts, z, x)), determinant)
 
 
-def newton(
+def solve_on_path(
     function: Callable,
-    system: System,
+    system: ScaledMechanics,
     z: Float[Array, "5"],
     u: Float[Array, "5"],
     *parameters,
     steps: int = 20,
     longest: float = 0.3,
-) -> Root:
-    """The place near `z` on the wire of `system` where `function(system, z, x, *parameters)` is 0, to rounding level.
+) -> PathRoot:
+    """The place near `z` on the wire of `scaled_mechanics` where `function(system, z, x, *parameters)` is 0, to rounding level.
 
     `u.x = 1`; each step is no longer than `longest`. A root that was not found shows in `residual`, never as NaN or an
     exception.
@@ -70,10 +70,10 @@ def newton(
 
     def step(state):
         z, _, _, _, count, _ = state
-        at = along_wire(fixed, z, u)
+        at = path_derivatives(fixed, z, u)
         value, rate = jax.jvp(lambda z, x: function(fixed, z, x, *settings), (z, at.x), (at.x, at.bend))
         left = constraints(fixed.contacts, z)
-        move = -times(at.back, left) - at.x * jnp.where(count > 0, value / rate, 0.0)
+        move = -fused_matmul(at.back, left) - at.x * jnp.where(count > 0, value / rate, 0.0)
         move = jnp.where(jnp.isfinite(move), move, 0.0)
         size = jnp.abs(move).max()
         move = move * jnp.minimum(1.0, longest / jnp.maximum(size, longest * jnp.finfo(z.dtype).eps))
@@ -82,18 +82,18 @@ def newton(
     def going(state):
         *_, residual, count, size = state
         # What is left is of the square of the step.
-        return (count < steps) & ((count < 2) | (size > digits(z, 9 / 16))) & (residual > 0)
+        return (count < steps) & ((count < 2) | (size > eps_power(z, 9 / 16))) & (residual > 0)
 
     far, none = jnp.asarray(jnp.inf, z.dtype), jnp.zeros(5, z.dtype)
-    nowhere = Along(jnp.zeros((5, 4), z.dtype), none, none, jnp.zeros((), z.dtype))
+    nowhere = LocalPath(jnp.zeros((5, 4), z.dtype), none, none, jnp.zeros((), z.dtype))
     start = (stop_gradient(z), nowhere, far, far, jnp.asarray(0, int), far)
     z, at, rate, residual, count, _ = stop_gradient(jax.lax.while_loop(going, step, start))
     residual = jnp.where(jnp.isfinite(residual), residual, jnp.inf)
-    back = times(at.back, constraints(system.contacts, z))
+    back = fused_matmul(at.back, constraints(system.contacts, z))
     z = z - jnp.where(jnp.isfinite(back), back, 0.0)
-    turn = times(at.back, constraint_rates(system.contacts, z, at.x))
+    turn = fused_matmul(at.back, constraint_velocity(system.contacts, z, at.x))
     x = jnp.where(jnp.isfinite(at.x), at.x, u) - jnp.where(jnp.isfinite(turn), turn, 0.0)
     late = function(system, z, x, *parameters) / rate
     late = jnp.where(jnp.isfinite(late), late, 0.0)
     along, bend = (jnp.where(jnp.isfinite(a), a, 0.0) for a in (at.x, at.bend))
-    return Root(z - along * late, x - bend * late, residual, count)
+    return PathRoot(z - along * late, x - bend * late, residual, count)

@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
 
-from wholearm_jax.core.arrays import digits
-from wholearm_jax.core.small_linalg import crossed, solve, times
-from wholearm_jax.model.contact_kinematics import GROUPS, PALM_END, ROOT, constraint_rows, constraints, frames
+from wholearm_jax.core.arrays import eps_power
+from wholearm_jax.core.small_linalg import null_vector, solve, fused_matmul
+from wholearm_jax.model.contact_kinematics import FEATURE_GROUPS, PALM_END, FINGER_ROOT, constraint_jacobian, constraints, contact_kinematics
 from wholearm_jax.model.scene import EDGE, VERTEX
 from wholearm_jax.tracing.continuation import oriented_tangent
-from wholearm_jax.tracing.path_root import newton
+from wholearm_jax.tracing.path_root import solve_on_path
 
 
-def project(system, rough):
+def project_onto_path(system, rough):
     """The wire's point nearest to the rough start: least-norm Newton steps to reach it, then Newton on nearness.
 
     Beside it how far constraints are from holding there, and a unit vector along the wire, of either sense.
@@ -24,52 +24,52 @@ def project(system, rough):
     fixed, far = stop_gradient(system), stop_gradient(rough)
 
     def least(z):
-        rows = constraint_rows(fixed.contacts, z)
-        move = -times(rows.T, solve(times(rows, rows.T), constraints(fixed.contacts, z)))
+        rows = constraint_jacobian(fixed.contacts, z)
+        move = -fused_matmul(rows.T, solve(fused_matmul(rows, rows.T), constraints(fixed.contacts, z)))
         move = jnp.where(jnp.isfinite(move), move, 0.0)
         return z + move * jnp.minimum(1.0, 0.3 / jnp.maximum(jnp.abs(move).max(), 1e-30))
 
     z = jax.lax.fori_loop(0, 12, lambda _, z: least(z), far)
     tangent, _ = oriented_tangent(fixed, z, far)  # of either sense
-    root = newton(lambda system, z, x, rough: x @ (z - rough), system, z, tangent, rough)
-    near = jnp.where(root.residual < digits(z, 3 / 8), root.z, z)
+    root = solve_on_path(lambda system, z, x, rough: x @ (z - rough), system, z, tangent, rough)
+    near = jnp.where(root.residual < eps_power(z, 3 / 8), root.z, z)
     fixed_near = stop_gradient(near)
     along, _ = oriented_tangent(fixed, fixed_near, stop_gradient(root.x))
     return near, jnp.abs(constraints(fixed.contacts, fixed_near)).max(), along
 
 
-def misplaced(system, z):
+def violates_contact_limits(system, z):
     """Whether a contact lies beyond its feature, a vertex behind the palm, a link within the object, or a convex object
     behind a finger that holds it.
 
     Behind a finger's line, vertices of a convex object may lie where the finger's tip touches an edge, not where a
     vertex touches the finger.
     """
-    tolerance = digits(z, 5 / 8)
-    held, pairs = frames(system.contacts, z), frames(system.candidates, z)
+    tolerance = eps_power(z, 5 / 8)
+    held, pairs = contact_kinematics(system.contacts, z), contact_kinematics(system.candidates, z)
     beyond = (held.along < system.contacts.lower - tolerance) | (held.along > system.contacts.upper + tolerance)
     inside = (pairs.along > system.candidates.lower) & (pairs.along < system.candidates.upper)
     behind = system.watched & system.candidates.on_link & ~system.behind & inside & (pairs.gap < -tolerance)
-    return jnp.any(beyond) | jnp.any(behind) | _pierced(system, pairs, tolerance)
+    return jnp.any(beyond) | jnp.any(behind) | _link_penetrates_object(system, pairs, tolerance)
 
 
 # Where each link begins and ends, and vertices against it: fingers from root to tip, the palm from left to right.
 _ENDS = (
-    ((1, ROOT), (1, EDGE), (1, VERTEX)),
-    ((2, ROOT), (2, EDGE), (2, VERTEX)),
+    ((1, FINGER_ROOT), (1, EDGE), (1, VERTEX)),
+    ((2, FINGER_ROOT), (2, EDGE), (2, VERTEX)),
     ((2, PALM_END), (1, PALM_END), (0, VERTEX)),
 )
-_LINKS = np.array([[GROUPS.index(group) for group in link] for link in _ENDS]).T
+_LINKS = np.array([[FEATURE_GROUPS.index(group) for group in link] for link in _ENDS]).T
 
 
-def _pierced(system, pairs, tolerance):
+def _link_penetrates_object(system, pairs, tolerance):
     """Whether part of a finger's contact edge or of the palm lies within the object.
 
     Lines through edges of the object cut each link into parts, and the middle of one lies within where the outline
     passes the rest of the link's line an odd number of times. Gaps and places along edges are linear on a link.
     """
     grouped = (pairs.gap, pairs.along, system.candidates.lower, system.candidates.upper, system.real)
-    gap, along, lower, upper, real = (a.reshape(len(GROUPS), -1) for a in grouped)
+    gap, along, lower, upper, real = (a.reshape(len(FEATURE_GROUPS), -1) for a in grouped)
     begin, end, against = _LINKS
 
     def on(values, share):
@@ -94,18 +94,18 @@ def _pierced(system, pairs, tolerance):
     return jnp.any((after > stops) & (times_ahead % 2 == 1) & ~beside)
 
 
-def dependent(system, z):
+def is_rank_deficient(system, z):
     """Whether the constraints depend on one another at `z`: their rows span no volume."""
-    rows = constraint_rows(system.contacts, z)
+    rows = constraint_jacobian(system.contacts, z)
     rows = rows / jnp.sqrt((rows**2).sum(1, keepdims=True))
-    return (crossed(rows) ** 2).sum() < digits(z, 3 / 4)
+    return (null_vector(rows) ** 2).sum() < eps_power(z, 3 / 4)
 
 
-def oriented(along, heading):
-    """A tangent, turned so that its coordinate `heading.coordinate` has the sign asked for."""
-    return along * jnp.where(along[leading(heading, along)] * heading.sign < 0, -1.0, 1.0)
+def orient_tangent(along, heading):
+    """A tangent, turned so that its coordinate `path_target.path_coordinate` has the sign asked for."""
+    return along * jnp.where(along[dominant_coordinate(heading, along)] * heading.sign < 0, -1.0, 1.0)
 
 
-def leading(heading, x):
+def dominant_coordinate(heading, x):
     """The coordinate that tells which way a wire goes."""
     return jnp.where(heading.coordinate < 0, jnp.argmax(jnp.abs(x)), heading.coordinate)
