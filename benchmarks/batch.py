@@ -32,9 +32,8 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 import wholearm_jax as wa
-from wholearm_jax.ensembles.batch import BLOCK, COARSE_PASS, check_scene
-from wholearm_jax.ensembles.ensemble import make_ensemble
-from wholearm_jax.model.schedule import TorqueSchedule, pad_schedule
+from wholearm_jax.ensembles import BLOCK, COARSE_PASS, check_scene, make_ensemble
+from wholearm_jax.model import TorqueSchedule, pad_schedule
 
 HERE = Path(__file__).parent
 COUNTS = (128, 1024, 8192, 65_536, 1_000_000)
@@ -127,8 +126,10 @@ def one_phase(torque) -> dict:
 
 def gradients(ensemble, torque) -> dict:
     """Checks with the gradient with respect to all torques, a block at a time."""
-    schedule, how = pad_schedule(torque), COARSE_PASS.how
-    level = COARSE_PASS._replace(how=replace(how, adjoint="reverse", steps=bool(np.any(np.diff(torque.times) == 0))))
+    schedule, options = pad_schedule(torque), COARSE_PASS.options
+    level = COARSE_PASS._replace(
+        options=replace(options, adjoint="reverse", steps=bool(np.any(np.diff(torque.times) == 0)))
+    )
 
     def one(number):
         def margin(values):
@@ -177,8 +178,7 @@ def margin_error(done) -> float:
 
 def laid_in(ensemble, torque):
     """The plan's prediction, and scenes of the ensemble with where each object lies in the hand."""
-    from wholearm_jax.execution.rollout import start_of
-    from wholearm_jax.execution.trials import start_near
+    from wholearm_jax.execution import start_near, start_of
 
     prediction = wa.simulate(ensemble.scene, torque)
     scenes = [ensemble.draw(np.asarray(number)) for number in range(ROLLOUTS)]
@@ -199,8 +199,7 @@ def roll_out(models, starts, torques) -> None:
 
 def rollouts(ensemble, torque) -> dict:
     """MuJoCo, its own friction, all threads: rates at the longest time step that still ends near the prediction."""
-    from wholearm_jax.execution.mujoco_model import CONVEX, build_mujoco_model
-    from wholearm_jax.execution.rollout import clock, execute, motor_torques
+    from wholearm_jax.execution import CONVEX, build_mujoco_model, clock, execute, motor_torques
 
     prediction, scenes, starts = laid_in(ensemble, torque)
     course = np.concatenate([np.asarray(t.z) for t in wa.trajectory(prediction)])
@@ -226,9 +225,8 @@ def rollouts(ensemble, torque) -> dict:
 
 def by_coulomb(ensemble, torque) -> dict:
     """Free bodies with Coulomb's friction, all processors: the rate at the longest step with right margins."""
-    from wholearm_jax.execution.mujoco_model import build_mujoco_model
-    from wholearm_jax.execution.rollout import clock, execute, motor_torques
-    from wholearm_jax.execution.trials import rollout_in_parallel as driven
+    from wholearm_jax.execution import build_mujoco_model, clock, execute, motor_torques
+    from wholearm_jax.execution import rollout_in_parallel as driven
 
     prediction, scenes, starts = laid_in(ensemble, torque)
     steps = [step for step in STEPS if step >= FINEST]

@@ -32,11 +32,11 @@ import numpy as np
 from scipy.special import beta, betainc
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import PathDynamics
-from wholearm_jax.margin.quasistatic import best_quasistatic_torque_batch
-from wholearm_jax.model.schedule import pad_schedule
-from wholearm_jax.phases.phase import simulate_phase
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.dynamics import PathDynamics
+from wholearm_jax.margin import best_quasistatic_torque_batch
+from wholearm_jax.model import pad_schedule
+from wholearm_jax.phases import simulate_phase
+from wholearm_jax.simulation import IntegratorOptions
 
 KNOTS, DEGREE = 31, 3
 FINE = 120  # collocation intervals of the best that is known
@@ -49,21 +49,21 @@ CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 class Piece(NamedTuple):
-    """A smooth piece of a wire: from `low` to `high` in shares of its length, speeds scaled by `factor` on entry.
+    """A smooth piece of a wire: from `low` to `high` in shares of its length, speeds scaled by `speed_ratio` on entry.
 
     `series[k, j]` is Chebyshev coefficient `k` of function `j`: `A0 ... A4`, then `F0 ... F4` of each contact.
     """
 
     low: float
     high: float
-    factor: float
+    speed_ratio: float
     series: np.ndarray
 
 
 class Wire(NamedTuple):
     """What the transcription needs of a `wholearm_jax` table."""
 
-    pieces: tuple[Piece, ...]
+    segments: tuple[Piece, ...]
     length: float
     limit: np.ndarray
 
@@ -82,7 +82,7 @@ class Course(NamedTuple):
 class Collocated:
     """What IPOPT made of a phase.
 
-    `course.plan_margin` [N] is the least force at the collocation points, `ipopt` its status. `margin` [N] and `verdict` are
+    `course.plan_margin` [N] is the least force at the collocation points, `ipopt` its status. `margin` [N] and `assessment` are
     those of the honest simulation of `torque` (knots x 2, N m); `missed` is the distance to the wire's end that it
     leaves and `speed` the speed, in wire lengths and in these a duration. It took `solves` solves, `iterations` in all,
     in `seconds` seconds (the best of them alone in `best_solve`) after `build` seconds of building. Of the `initial_guesses`
@@ -93,7 +93,7 @@ class Collocated:
     course: Course
     ipopt: str
     margin: float
-    verdict: str
+    assessment: str
     missed: float
     speed: float
     iterations: int
@@ -107,7 +107,7 @@ class Collocated:
     @property
     def succeeded(self) -> bool:
         """Whether IPOPT converged and the simulation arrives with every contact compressive."""
-        return self.ipopt in CONVERGED and self.verdict == "ok"
+        return self.ipopt in CONVERGED and self.assessment == "ok"
 
     @property
     def nearly(self) -> bool:
@@ -118,25 +118,25 @@ class Collocated:
         return self.ipopt in CONVERGED and self.margin > 0 and self.missed < 1e-3 and self.speed < 0.05
 
 
-def collocate(table: PathDynamics, duration: float, *, knots: int = KNOTS) -> Collocated:
+def collocate(dynamics: PathDynamics, duration: float, *, knots: int = KNOTS) -> Collocated:
     """Maximise a phase's margin by collocation, one interval between knots, from up to three first guesses.
 
     The minimum-jerk motion comes first, then the bell motion that can be squeezed hardest, then the even one; each
     with the best squeeze at each instant. The first that succeeds is returned, else the best. The programme is written
     out in scalars: IPOPT is then about four times faster, although building takes twenty times longer.
     """
-    phase = Phase(read(table), duration, knots, 1)
+    phase = Phase(read(dynamics), duration, knots, 1)
     tried: list[Collocated] = []
-    for bell in dict.fromkeys((MINIMUM_JERK, _hardest(table, duration), (1, 1))):
-        solves = _climbed(phase, _course(table, phase, bell), {"expand": True})
-        tried.append(_collected(table, phase, solves))
+    for bell in dict.fromkeys((MINIMUM_JERK, _hardest(dynamics, duration), (1, 1))):
+        solves = _climbed(phase, _course(dynamics, phase, bell), {"expand": True})
+        tried.append(_collected(dynamics, phase, solves))
         if tried[-1].succeeded:
             break
     best = max(tried, key=lambda one: (one.succeeded, one.ipopt in CONVERGED, one.margin))
     return replace(best, guesses=len(tried), spent=sum(one.build + one.solve for one in tried))
 
 
-def best_known(table: PathDynamics, duration: float, coarse: Collocated, *, enough: float = np.inf) -> Collocated:
+def best_known(dynamics: PathDynamics, duration: float, coarse: Collocated, *, enough: float = np.inf) -> Collocated:
     """The largest margin that collocation finds with the same knots, whatever it costs, or one of `enough` newtons.
 
     Each interval between knots is divided, into `FINE` or more in all, so that forces are held at many times and the
@@ -144,13 +144,13 @@ def best_known(table: PathDynamics, duration: float, coarse: Collocated, *, enou
     IPOPT's strategies for its barrier, since these lead to different optima.
     """
     knots = len(coarse.torque)
-    phase = Phase(read(table), duration, knots, -(-FINE // (knots - 1)))
-    jerk, hardest = (_course(table, phase, bell) for bell in (MINIMUM_JERK, _hardest(table, duration)))
+    phase = Phase(read(dynamics), duration, knots, -(-FINE // (knots - 1)))
+    jerk, hardest = (_course(dynamics, phase, bell) for bell in (MINIMUM_JERK, _hardest(dynamics, duration)))
     starts = ((jerk, "monotone"), (jerk, "adaptive"), (coarse.course, "monotone"), (hardest, "monotone"))
     found: list[Collocated] = []
     for start, strategy in starts:
         options = {"ipopt.mu_strategy": strategy, "ipopt.max_iter": 300}
-        found.append(_collected(table, phase, _explored(phase, start, options)))
+        found.append(_collected(dynamics, phase, _explored(phase, start, options)))
         if found[-1].succeeded and found[-1].margin >= enough:
             break
     return max(found, key=lambda one: (one.succeeded, one.margin))
@@ -159,20 +159,22 @@ def best_known(table: PathDynamics, duration: float, coarse: Collocated, *, enou
 # --- the wire as smooth functions -------------------------------------------------------------------------------------
 
 
-def read(table: PathDynamics) -> Wire:
+def read(dynamics: PathDynamics) -> Wire:
     """One Chebyshev series a piece, of the degree that reproduces the table's polynomials to `FIT`."""
-    count = int(table.count)
-    breaks = np.asarray(table.breaks)[: count + 1]
+    count = int(dynamics.count)
+    breaks = np.asarray(dynamics.breakpoints)[: count + 1]
     shares = (breaks - breaks[0]) / (breaks[-1] - breaks[0])
-    pieces = [Piece(shares[k], shares[k + 1], float(table.factor[k]), _series(table, k)) for k in range(count)]
-    return Wire(tuple(pieces), float(table.length), np.asarray(table.torque_limit))
+    segments = [
+        Piece(shares[k], shares[k + 1], float(dynamics.speed_ratio[k]), _series(dynamics, k)) for k in range(count)
+    ]
+    return Wire(tuple(segments), float(dynamics.length), np.asarray(dynamics.torque_limit))
 
 
-def _series(table: PathDynamics, piece: int) -> np.ndarray:
-    first, panels = int(table.first[piece]), int(table.panels[piece])
+def _series(dynamics: PathDynamics, segment: int) -> np.ndarray:
+    first, panels = int(dynamics.first[segment]), int(dynamics.panels[segment])
     rows = slice(first, first + panels)
-    force = np.asarray(table.force[rows])
-    tables = np.concatenate([np.asarray(table.acceleration[rows]), force.reshape(*force.shape[:2], -1)], axis=2)
+    force = np.asarray(dynamics.force[rows])
+    tables = np.concatenate([np.asarray(dynamics.acceleration[rows]), force.reshape(*force.shape[:2], -1)], axis=2)
     for degree in range(6, 120, 3):
         series = np.polynomial.chebyshev.chebinterpolate(lambda x: _evaluate(tables, x), degree)
         check = np.linspace(-1, 1, 401)
@@ -200,7 +202,7 @@ def _evaluate(tables: np.ndarray, x: np.ndarray) -> np.ndarray:
 class Phase(NamedTuple):
     """What is to be solved: `duration` [s], `knots` torques a joint, `refine` collocation intervals between two."""
 
-    wire: Wire
+    path: Wire
     duration: float
     knots: int
     refine: int
@@ -211,13 +213,13 @@ class Phase(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A stretch of time with its own cubic: in interval `row`, on `piece`, from `begin` to `end` in intervals.
+    """A stretch of time with its own cubic: in interval `row`, on `segment`, from `begin` to `end` in intervals.
 
     `begin` and `end` are numbers, or variables where a piece of the wire ends within the interval.
     """
 
     row: int
-    piece: int
+    segment: int
     begin: ca.MX | float
     end: ca.MX | float
 
@@ -242,8 +244,8 @@ def _programme(phase: Phase, rows: tuple[int, ...], options: dict[str, Any]) -> 
     parts = _parts(phase, rows, splits)
     states = ca.MX.sym("states", 2, DEGREE * len(parts))
     equal, positive, times, first, before = [], [], [], 0, ca.MX.zeros(2, 1)
-    for number in range(len(phase.wire.pieces)):
-        own = [part for part in parts if part.piece == number]
+    for number in range(len(phase.path.segments)):
+        own = [part for part in parts if part.segment == number]
         last = first + DEGREE * len(own)
         block = _block(phase, own, before, states[:, first:last], tau)
         equal.append(ca.vec(block.defects))
@@ -271,9 +273,9 @@ def _parts(phase: Phase, rows: tuple[int, ...], splits: ca.MX) -> list[Part]:
     parts = []
     for row in range(phase.intervals):
         begin: ca.MX | float = 0.0
-        for piece in range(sum(r < row for r in rows), sum(r <= row for r in rows) + 1):
-            end = splits[piece] if piece < len(rows) and rows[piece] == row else 1.0
-            parts.append(Part(row, piece, begin, end))
+        for segment in range(sum(r < row for r in rows), sum(r <= row for r in rows) + 1):
+            end = splits[segment] if segment < len(rows) and rows[segment] == row else 1.0
+            parts.append(Part(row, segment, begin, end))
             begin = end
     return parts
 
@@ -292,10 +294,10 @@ def _block(phase: Phase, parts: list[Part], before: ca.MX, states: ca.MX, tau: c
 
     Forces count at every collocation point and where the piece is entered, since they jump there.
     """
-    piece = phase.wire.pieces[parts[0].piece]
+    segment = phase.path.segments[parts[0].segment]
     points = np.array(ca.collocation_points(DEGREE, "radau"))
     slopes = ca.DM(ca.collocation_coeff(points.tolist())[0])
-    before = before * ca.DM([1.0, piece.factor])
+    before = before * ca.DM([1.0, segment.speed_ratio])
     torques, times, widths, rates = [_torque(phase, tau, parts[0].row, parts[0].begin)], [], [], []
     for k, part in enumerate(parts):
         own, width = states[:, DEGREE * k : DEGREE * (k + 1)], part.end - part.begin
@@ -306,31 +308,31 @@ def _block(phase: Phase, parts: list[Part], before: ca.MX, states: ca.MX, tau: c
             torques.append(_torque(phase, tau, part.row, share))
             times.append((part.row + share) / phase.intervals)
             widths.append(width / phase.intervals)
-    pull, forces = _motion(phase, piece).map(len(torques))(ca.horzcat(before, states), ca.horzcat(*torques))
+    pull, forces = _motion(phase, segment).map(len(torques))(ca.horzcat(before, states), ca.horzcat(*torques))
     field = ca.vertcat(states[1, :], pull[1:])
     width = ca.horzcat(*widths)
     # At rest the object must start forward; a divided interval must not have a negative part.
-    entry = pull[0] if parts[0].piece == 0 else ca.MX(1.0) * (parts[0].end - parts[0].begin)
+    entry = pull[0] if parts[0].segment == 0 else ca.MX(1.0) * (parts[0].end - parts[0].begin)
     return Block(ca.horzcat(*rates) - ca.repmat(width, 2, 1) * field, forces, ca.horzcat(*times), entry)
 
 
-def _motion(phase: Phase, piece: Piece) -> ca.Function:
+def _motion(phase: Phase, segment: Piece) -> ca.Function:
     """`dw/du` and the contact forces [N] as a function of the state `(p, w)` and the torques in limits."""
     state, tau = ca.SX.sym("state", 2), ca.SX.sym("tau", 2)
-    motion, force = _coefficients(piece, state[0])
-    speed = state[1] * phase.wire.length / phase.duration
-    terms = ca.vertcat(1.0, speed**2, speed, tau * phase.wire.limit)
-    pull = phase.duration**2 / phase.wire.length * ca.dot(motion, terms)
+    motion, force = _coefficients(segment, state[0])
+    speed = state[1] * phase.path.length / phase.duration
+    terms = ca.vertcat(1.0, speed**2, speed, tau * phase.path.limit)
+    pull = phase.duration**2 / phase.path.length * ca.dot(motion, terms)
     return ca.Function("motion", [state, tau], [pull, ca.mtimes(force, terms)])
 
 
-def _coefficients(piece: Piece, share: ca.SX) -> tuple[ca.SX, ca.SX]:
+def _coefficients(segment: Piece, share: ca.SX) -> tuple[ca.SX, ca.SX]:
     """`A` (5) and `F` (contacts x 5) at a share of the wire."""
-    x = (2 * share - piece.low - piece.high) / (piece.high - piece.low)
+    x = (2 * share - segment.low - segment.high) / (segment.high - segment.low)
     terms = [ca.SX(1), x]
-    while len(terms) < len(piece.series):
+    while len(terms) < len(segment.series):
         terms.append(2 * x * terms[-1] - terms[-2])
-    values = ca.mtimes(ca.DM(piece.series.T), ca.vertcat(*terms))
+    values = ca.mtimes(ca.DM(segment.series.T), ca.vertcat(*terms))
     return values[:5], ca.reshape(values[5:], 5, -1).T
 
 
@@ -343,14 +345,14 @@ def _torque(phase: Phase, tau: ca.MX, row: int, share) -> ca.MX:
 
 def _limits(phase: Phase, parts: list[Part], splits: int) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the variables: torques, splits in [0, 1], states within their piece, its end where the next begins."""
-    pieces = phase.wire.pieces
+    segments = phase.path.segments
     states = np.zeros((2, DEGREE * len(parts), 2))  # lower and upper bounds of p and w
-    states[0, :, 0] = np.repeat([pieces[part.piece].low for part in parts], DEGREE)
-    states[1, :, 0] = np.repeat([pieces[part.piece].high for part in parts], DEGREE)
+    states[0, :, 0] = np.repeat([segments[part.segment].low for part in parts], DEGREE)
+    states[1, :, 0] = np.repeat([segments[part.segment].high for part in parts], DEGREE)
     states[1, :, 1] = np.inf
     for k, part in enumerate(parts):
-        if k + 1 == len(parts) or parts[k + 1].piece > part.piece:
-            states[0, DEGREE * (k + 1) - 1, 0] = pieces[part.piece].high
+        if k + 1 == len(parts) or parts[k + 1].segment > part.segment:
+            states[0, DEGREE * (k + 1) - 1, 0] = segments[part.segment].high
     states[1, -1, 1] = 0.0
     one = np.ones(2 * phase.knots)
     return (
@@ -369,36 +371,38 @@ def _bell(u: np.ndarray, p: int, q: int) -> tuple[np.ndarray, np.ndarray, np.nda
     return betainc(p + 1, q + 1, u), speed, speed * (p / inner - q / (1 - inner))
 
 
-def _squeezed(table: PathDynamics, duration: float, bell: tuple[int, int], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _squeezed(
+    dynamics: PathDynamics, duration: float, bell: tuple[int, int], times: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The best squeeze on a bell motion at shares `fused_matmul`: torques [N m] and the least forces [N]."""
     place, speed, pull = _bell(times, *bell)
-    length = float(table.length)
-    s = float(table.breaks[0]) + length * place
-    held = _holds(table, s, speed * length / duration, pull * length / duration**2)
+    length = float(dynamics.length)
+    s = float(dynamics.breakpoints[0]) + length * place
+    held = _holds(dynamics, s, speed * length / duration, pull * length / duration**2)
     return np.asarray(held.torque), np.asarray(held.margin)
 
 
 _holds = jax.jit(best_quasistatic_torque_batch)
 
 
-def _hardest(table: PathDynamics, duration: float) -> tuple[int, int]:
+def _hardest(dynamics: PathDynamics, duration: float) -> tuple[int, int]:
     """The bell motion whose best squeeze has the largest least force."""
     times = np.linspace(0, 1, 241)
-    return max(BELLS, key=lambda bell: _squeezed(table, duration, bell, times)[1].min())
+    return max(BELLS, key=lambda bell: _squeezed(dynamics, duration, bell, times)[1].min())
 
 
-def _course(table: PathDynamics, phase: Phase, bell: tuple[int, int]) -> Course:
+def _course(dynamics: PathDynamics, phase: Phase, bell: tuple[int, int]) -> Course:
     u = np.linspace(0, 1, 1501)
-    tau, margin = _squeezed(table, phase.duration, bell, np.linspace(0, 1, phase.knots))
+    tau, margin = _squeezed(dynamics, phase.duration, bell, np.linspace(0, 1, phase.knots))
     place, speed, _ = _bell(u, *bell)
     # A motion that no torque within limits can follow begins at the limits.
-    tau = np.clip(np.nan_to_num(tau / phase.wire.limit), -0.95, 0.95)
+    tau = np.clip(np.nan_to_num(tau / phase.path.limit), -0.95, 0.95)
     return Course(u, place, speed, tau, max(float(margin.min()), 0.0))
 
 
 def _passed(phase: Phase, course: Course) -> tuple[tuple[int, ...], np.ndarray]:
     """The intervals in which a course passes the pieces' ends, and where in them."""
-    ends = [piece.high for piece in phase.wire.pieces[:-1]]
+    ends = [segment.high for segment in phase.path.segments[:-1]]
     at = np.interp(ends, course.p, course.u) * phase.intervals
     rows = np.clip(at.astype(int), 0, phase.intervals - 1)
     return tuple(int(row) for row in rows), np.clip(at - rows, 0.02, 0.98)
@@ -475,21 +479,23 @@ def _beside(phase: Phase, solve: Solve, step: np.ndarray) -> tuple[tuple[int, ..
     return tuple(moved.tolist()), np.where(step < 0, 0.98, np.where(step > 0, 0.02, solve.splits))
 
 
-def _collected(table: PathDynamics, phase: Phase, solves: list[Solve]) -> Collocated:
+def _collected(dynamics: PathDynamics, phase: Phase, solves: list[Solve]) -> Collocated:
     """The best of several solves, simulated."""
     best = max(solves, key=lambda one: one.rank)
-    torque = best.course.tau * phase.wire.limit
-    schedule = pad_schedule(wa.torque(np.linspace(0, phase.duration, phase.knots), torque))
-    outcome = simulate_phase(table, schedule, jnp.zeros(()), jnp.asarray(phase.duration), IntegratorOptions(), "rest")
+    torque = best.course.tau * phase.path.limit
+    schedule = pad_schedule(wa.torque_schedule(np.linspace(0, phase.duration, phase.knots), torque))
+    outcome = simulate_phase(
+        dynamics, schedule, jnp.zeros(()), jnp.asarray(phase.duration), IntegratorOptions(), "rest"
+    )
     last = int(outcome.motion.count)
     return Collocated(
         torque=torque,
         course=best.course,
         ipopt=best.status,
-        margin=float(outcome.score.margin),
-        verdict=wa.Status(int(outcome.verdict.status)).label,
-        missed=(float(table.breaks[-1]) - float(outcome.motion.s[last])) / phase.wire.length,
-        speed=float(outcome.motion.w[last]) / phase.wire.length,
+        margin=float(outcome.margin_result.margin),
+        assessment=wa.Status(int(outcome.assessment.status)).label,
+        missed=(float(dynamics.breakpoints[-1]) - float(outcome.motion.s[last])) / phase.path.length,
+        speed=float(outcome.motion.w[last]) / phase.path.length,
         solves=len(solves),
         best_solve=best.solve,
         **{name: sum(getattr(one, name) for one in solves) for name in ("iterations", "build", "solve")},
@@ -525,15 +531,16 @@ def main() -> None:
         scene = eqx.tree_at(lambda s: [p.duration for p in s.phases], scene, [chosen.duration] * len(scene.phases))
         traced = wa.trace(scene)
         for phase, at, top in zip(scene.phases, traced, wa.bounds(scene, traced=traced), strict=True):
-            one = collocate(at.table, chosen.duration, knots=chosen.knots)
+            one = collocate(at.dynamics, chosen.duration, knots=chosen.knots)
             if chosen.best:
-                one = best_known(at.table, chosen.duration, one)
+                one = best_known(at.dynamics, chosen.duration, one)
             forces = f"{one.course.least:7.4f} {one.margin:10.4f} {float(top.value):10.4f}"
             cost = f"{one.iterations:5d} {one.build:6.2f} {one.solve:6.2f}"
             failed = "" if one.ipopt in CONVERGED else f"  {one.ipopt}"
             name = str(name)[-12:]
             print(
-                f"{name:12s} {phase.name:12s} {forces}  {one.verdict:14s} {one.missed:7.0e} {cost}{failed}", flush=True
+                f"{name:12s} {phase.name:12s} {forces}  {one.assessment:14s} {one.missed:7.0e} {cost}{failed}",
+                flush=True,
             )
 
 

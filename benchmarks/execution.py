@@ -15,9 +15,8 @@ import numpy as np
 from measure import RESULTS, save
 
 import wholearm_jax as wa
-from wholearm_jax.execution.mujoco_model import ContactCompliance
-from wholearm_jax.execution.rollout import execute
-from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
+from wholearm_jax.execution import ContactCompliance, execute
+from wholearm_jax.plotting import LINK_COLOURS as COLOURS
 
 DATA = Path(__file__).parents[1] / "tests" / "data"
 SCENES = ("heptagon", "hexagon")

@@ -18,9 +18,9 @@ import numpy as np
 from random_plans import _grasps, random_object, write
 
 import wholearm_jax as wa
-from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.model.scene import Phase, contact_formation, path_target
-from wholearm_jax.planning.successors import Successor, exit_velocity, successor_formations
+from wholearm_jax.files import to_dict
+from wholearm_jax.model import Phase, contact_formation, path_target
+from wholearm_jax.planning import Successor, exit_velocity, successor_formations
 
 SHORTEST, LEAST_BOUND, SLOWED = 0.2, 0.2, 0.2  # wire [object radii], bound [N], speed after an impact over that before
 
@@ -50,7 +50,7 @@ def _from(grasp, shape, hand, phases):
     row = {"name": "first", "contacts": list(contacts), "toward": "x-", "duration": 1.0}
     scene = wa.parse({"title": "", "gravity": 9.81, "hand": hand, "object": shape, "start": start, "phase": [row]})
     (traced,) = wa.trace(scene)
-    if int(traced.table.status) != 0:
+    if int(traced.dynamics.status) != 0:
         return
     z = traced.begin
     scene = eqx.tree_at(lambda s: s.start, scene, z)
@@ -67,12 +67,14 @@ def chains(scene: wa.Scene, z, depth: int, z_dot=None) -> Iterator[tuple[Success
         if depth == 1:
             yield (way,)
         else:
-            yield from ((way, *rest) for rest in chains(scene, way.end, depth - 1, exit_velocity(way.traced.table)))
+            yield from ((way, *rest) for rest in chains(scene, way.end, depth - 1, exit_velocity(way.traced.dynamics)))
 
 
 def _phase(number: int, way: Successor, duration: float, last: bool) -> Phase:
     arrive = "rest" if last else "moving"
-    return Phase(f"phase {number}", contact_formation(way.contacts), path_target(way.toward), jnp.asarray(duration), arrive)
+    return Phase(
+        f"phase {number}", contact_formation(way.contacts), path_target(way.toward), jnp.asarray(duration), arrive
+    )
 
 
 def main() -> None:

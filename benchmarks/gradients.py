@@ -26,9 +26,9 @@ import measure
 import numpy as np
 
 import wholearm_jax as wa
-from wholearm_jax.margin.contact_forces import minimum_margin
-from wholearm_jax.model.schedule import TorqueSchedule, pad_schedule, restrict_to_phase
-from wholearm_jax.simulation.phase_motion import simulate_motion
+from wholearm_jax.margin import minimum_margin
+from wholearm_jax.model import TorqueSchedule, pad_schedule, restrict_to_phase
+from wholearm_jax.simulation import simulate_motion
 
 HERE = Path(__file__).parent
 KNOTS = (4, 8, 16, 32, 64, 128)
@@ -46,22 +46,30 @@ def given(phase: int, knots: int) -> TorqueSchedule:
     times, values = np.asarray(line.times), np.asarray(line.values)
     rows = np.flatnonzero((times >= phase) & (times <= phase + 1))[-2:] if phase else np.array([0, 1])
     share = np.linspace(0.0, 1.0, knots)[:, None]
-    return TorqueSchedule(jnp.asarray(share[:, 0]), jnp.asarray(values[rows[0]] * (1 - share) + values[rows[1]] * share))
+    return TorqueSchedule(
+        jnp.asarray(share[:, 0]), jnp.asarray(values[rows[0]] * (1 - share) + values[rows[1]] * share)
+    )
 
 
-def margin(values, times, table, duration, how: wa.Integration):
+def margin(values, times, dynamics, duration, options: wa.IntegratorOptions):
     """The margin of one phase."""
-    seen = restrict_to_phase(pad_schedule(TorqueSchedule(times, values)), jnp.zeros(()), duration)
-    return minimum_margin(table, seen, duration, simulate_motion(table, seen, duration, how=how), how).margin
+    phase_schedule = restrict_to_phase(pad_schedule(TorqueSchedule(times, values)), jnp.zeros(()), duration)
+    return minimum_margin(
+        dynamics,
+        phase_schedule,
+        duration,
+        simulate_motion(dynamics, phase_schedule, duration, options=options),
+        options,
+    ).margin
 
 
-def programs(times, values, table) -> dict[str, tuple]:
+def programs(times, values, dynamics) -> dict[str, tuple]:
     """For the value alone and each mode: a compiled program of (values, tolerance), and the seconds it took to make."""
     duration = jnp.ones(())
 
     def function(adjoint):
         return lambda v, tolerance: margin(
-            v, times, table, duration, wa.Integration(tolerance=tolerance, adjoint=adjoint)
+            v, times, dynamics, duration, wa.IntegratorOptions(tolerance=tolerance, adjoint=adjoint)
         )
 
     def forward(v, tolerance):
@@ -79,12 +87,12 @@ def programs(times, values, table) -> dict[str, tuple]:
     return made
 
 
-def costs(table, phase: int, counts, repeats: int) -> list[dict]:
+def costs(dynamics, phase: int, counts, repeats: int) -> list[dict]:
     """Run and compile times over the number of knots."""
     rows = []
     for knots in counts:
         torque = given(phase, knots)
-        made = programs(torque.times, torque.values, table)
+        made = programs(torque.times, torque.values, dynamics)
         at = (torque.values, jnp.asarray(1e-10))
         times = measure.compare({name: partial(call, *at) for name, (call, _) in made.items()}, repeats=repeats)
         row = {"knots": knots, "seconds": times, "compile": {name: seconds for name, (_, seconds) in made.items()}}
@@ -109,11 +117,11 @@ def differences(call, values) -> tuple[np.ndarray, float]:
     return found[1], float(np.abs(found[0] - found[1]).max() / np.abs(found[1]).max())
 
 
-def accuracy(table, phase: int, tolerances, repeats: int) -> dict:
+def accuracy(dynamics, phase: int, tolerances, repeats: int) -> dict:
     """Gradient errors and times over tolerances."""
     torque = given(phase, CHECKED)
     torque = TorqueSchedule(torque.times, WEAKER * torque.values)
-    made = {name: call for name, (call, _) in programs(torque.times, torque.values, table).items()}
+    made = {name: call for name, (call, _) in programs(torque.times, torque.values, dynamics).items()}
     true, doubt = differences(made["value"], torque.values)
     rows = []
     for tolerance in tolerances:
@@ -177,10 +185,10 @@ def main() -> None:
     scene = wa.load("heptagon")
     traced, found = wa.trace(scene), {}
     for phase in (1,) if quick else (0, 1):
-        table = traced[phase].table
+        dynamics = traced[phase].dynamics
         found[scene.phases[phase].name] = {
-            "costs": costs(table, phase, KNOTS[::2] if quick else KNOTS, 3 if quick else 7),
-            "accuracy": accuracy(table, phase, TOLERANCES[::3] if quick else TOLERANCES, 3 if quick else 7),
+            "costs": costs(dynamics, phase, KNOTS[::2] if quick else KNOTS, 3 if quick else 7),
+            "accuracy": accuracy(dynamics, phase, TOLERANCES[::3] if quick else TOLERANCES, 3 if quick else 7),
         }
     tabulate(found)
     if not quick:

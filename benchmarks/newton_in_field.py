@@ -20,12 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core.programs import Program
-from wholearm_jax.dynamics.path_dynamics import PathDynamics, equations_of_motion, evaluate, locate_panel
-from wholearm_jax.model.mechanics import ScaledMechanics
-from wholearm_jax.model.schedule import PhaseSchedule, interval, torque_at
-from wholearm_jax.tracing.path import ContactPath
-from wholearm_jax.tracing.path_root import path_derivatives, solve_on_path
+from wholearm_jax.core import Program
+from wholearm_jax.dynamics import PathDynamics, equations_of_motion, evaluate, locate_panel
+from wholearm_jax.model import PhaseSchedule, ScaledMechanics, interval, torque_at
+from wholearm_jax.tracing import ContactPath, path_derivatives, solve_on_path
 
 PLACES = 33  # known places of the wire: Newton's method starts within a sixty-fourth of its length
 
@@ -33,13 +31,13 @@ PLACES = 33  # known places of the wire: Newton's method starts within a sixty-f
 class Direct(eqx.Module):
     """What the direct way knows of a wire: its chart, signs, where its pieces end, and a few places to start from."""
 
-    system: ScaledMechanics
+    mechanics: ScaledMechanics
     chart: Float[Array, "5"]
     anchor: Float[Array, "5"]
     anchor_s: Float[Array, ""]
-    slip_sign: Float[Array, "pieces contacts"]
-    joint_sign: Float[Array, "pieces 2"]
-    breaks: Float[Array, "pieces_1"]
+    slip_sign: Float[Array, "segments contacts"]
+    joint_sign: Float[Array, "segments 2"]
+    breakpoints: Float[Array, "segments_1"]
     s: Float[Array, "places"]
     z: Float[Array, "places 5"]
     x: Float[Array, "places 5"]
@@ -48,56 +46,64 @@ class Direct(eqx.Module):
 class Path(NamedTuple):
     """Accepted steps of each piece, `count[k]` of them: rows (share, s, w), the piece's start not among them."""
 
-    steps: Float[Array, "pieces steps 3"]
-    count: Int[Array, "pieces"]
+    steps: Float[Array, "segments steps 3"]
+    count: Int[Array, "segments"]
 
 
-def direct(system: ScaledMechanics, wire: ContactPath, table: PathDynamics) -> Direct:
+def direct(mechanics: ScaledMechanics, path: ContactPath, dynamics: PathDynamics) -> Direct:
     """The direct way's view of a wire of one chart."""
-    pieces = int(table.count)
-    if not np.all(np.asarray(wire.chart[:pieces]) == np.asarray(wire.chart[0])):
+    segments = int(dynamics.count)
+    if not np.all(np.asarray(path.chart[:segments]) == np.asarray(path.chart[0])):
         raise ValueError("the direct way is written for wires of one chart")
-    s = jnp.linspace(wire.breaks[0], wire.breaks[pieces], PLACES)
+    s = jnp.linspace(path.breakpoints[0], path.breakpoints[segments], PLACES)
 
     def place(s):
-        piece = jnp.minimum((s >= wire.breaks[1:pieces]).sum(), pieces - 1)
-        panel, xi = locate_panel(table, piece, s)
-        z = evaluate(table.configuration, panel, xi) / system.configuration_unit
-        return z, path_derivatives(system, z, wire.chart[0]).x
+        segment = jnp.minimum((s >= path.breakpoints[1:segments]).sum(), segments - 1)
+        panel, xi = locate_panel(dynamics, segment, s)
+        z = evaluate(dynamics.configuration, panel, xi) / mechanics.configuration_unit
+        return z, path_derivatives(mechanics, z, path.chart[0]).x
 
     z, x = jax.vmap(place)(s)
-    signs = wire.slip_sign[:pieces], wire.joint_sign[:pieces]
-    return Direct(system, wire.chart[0], wire.anchor[0], wire.anchor_s[0], *signs, wire.breaks[: pieces + 1], s, z, x)
+    signs = path.slip_sign[:segments], path.joint_sign[:segments]
+    return Direct(
+        mechanics, path.chart[0], path.anchor[0], path.anchor_s[0], *signs, path.breakpoints[: segments + 1], s, z, x
+    )
 
 
-def solve(way: Direct, piece, s, w, tau, duration):
+def solve(way: Direct, segment, s, w, tau, duration):
     """`z`, `x`, `a` and `c_n` [N] at one state, from nothing but the C-functions and the 5x5 system."""
     near = jnp.argmin(jnp.abs(way.s - s))
     height = way.chart @ way.anchor + s - way.anchor_s
 
-    def above(system, z, x, height):
+    def above(mechanics, z, x, height):
         return way.chart @ z - height
 
-    z = solve_on_path(above, way.system, way.z[near] + way.x[near] * (s - way.s[near]), way.chart, height).z
-    at = path_derivatives(way.system, z, way.chart)
-    matrix, right = equations_of_motion(way.system, z, at.x, at.bend, way.slip_sign[piece], way.joint_sign[piece])
+    z = solve_on_path(above, way.mechanics, way.z[near] + way.x[near] * (s - way.s[near]), way.chart, height).z
+    at = path_derivatives(way.mechanics, z, way.chart)
+    matrix, right = equations_of_motion(
+        way.mechanics, z, at.x, at.curvature, way.slip_sign[segment], way.joint_sign[segment]
+    )
     v = w / duration
-    terms = jnp.concatenate([jnp.stack([jnp.ones_like(v), v**2, v]), tau / way.system.torque_unit])
+    terms = jnp.concatenate([jnp.stack([jnp.ones_like(v), v**2, v]), tau / way.mechanics.torque_unit])
     answer = jnp.linalg.solve(matrix, right @ terms)
-    return z, at.x, answer[0], answer[1:] * way.system.force_unit
+    return z, at.x, answer[0], answer[1:] * way.mechanics.force_unit
 
 
 @Program
-def move(way: Direct, seen: PhaseSchedule, duration, solver: dfx.AbstractSolver, tolerance, max_steps: int) -> Path:
+def move(
+    way: Direct, phase_schedule: PhaseSchedule, duration, solver: dfx.AbstractSolver, tolerance, max_steps: int
+) -> Path:
     """Move from rest at the wire's start to its end or to the end of time."""
-    share, y = jnp.zeros(()), jnp.stack([way.breaks[0], jnp.zeros(())])
+    share, y = jnp.zeros(()), jnp.stack([way.breakpoints[0], jnp.zeros(())])
     steps, counts = [], []
-    for piece in range(way.slip_sign.shape[0]):
-        solution = _until(way, seen, duration, solver, tolerance, max_steps, piece, share, y)
+    for segment in range(way.slip_sign.shape[0]):
+        solution = _until(way, phase_schedule, duration, solver, tolerance, max_steps, segment, share, y)
         taken, passed = solution.stats["num_accepted_steps"], dfx.is_event(solution.result)
         rows = jnp.concatenate([solution.ts[:, None], solution.ys], axis=1)
         before = jnp.where(taken > 1, rows[jnp.maximum(taken - 2, 0)], jnp.concatenate([share[None], y]))
-        landed = _land(way, seen, duration, solver, piece, before, rows[taken - 1, 0], way.breaks[piece + 1])
+        landed = _land(
+            way, phase_schedule, duration, solver, segment, before, rows[taken - 1, 0], way.breakpoints[segment + 1]
+        )
         last = jnp.where(passed, landed, rows[taken - 1])
         steps.append(rows.at[taken - 1].set(last))
         # Where time is over in an earlier piece there is nothing left to do.
@@ -107,58 +113,60 @@ def move(way: Direct, seen: PhaseSchedule, duration, solver: dfx.AbstractSolver,
 
 
 @Program
-def moves(way: Direct, seen: PhaseSchedule, durations, solver: dfx.AbstractSolver, tolerance, max_steps: int) -> Path:
+def moves(
+    way: Direct, phase_schedule: PhaseSchedule, durations, solver: dfx.AbstractSolver, tolerance, max_steps: int
+) -> Path:
     """One phase after the other, in one program."""
-    return jax.lax.map(lambda duration: move(way, seen, duration, solver, tolerance, max_steps), durations)
+    return jax.lax.map(lambda duration: move(way, phase_schedule, duration, solver, tolerance, max_steps), durations)
 
 
 @Program
-def states(way: Direct, seen: PhaseSchedule, duration, path: Path):
+def states(way: Direct, phase_schedule: PhaseSchedule, duration, path: Path):
     """`z` and `z_dot` (SI) and `c_n` [N] at every step of a path."""
 
-    def one(piece, row):
+    def one(segment, row):
         share, s, w = row
         # A step that ends on a knot belongs to the interval before it; the torque is continuous.
-        tau = torque_at(seen, interval(seen, share), share)
-        z, x, _, cn = solve(way, piece, s, w, tau, duration)
-        unit = way.system.configuration_unit
+        tau = torque_at(phase_schedule, interval(phase_schedule, share), share)
+        z, x, _, cn = solve(way, segment, s, w, tau, duration)
+        unit = way.mechanics.configuration_unit
         return z * unit, x * w / duration * unit, cn
 
-    pieces = jnp.arange(path.count.shape[0])
-    return jax.vmap(jax.vmap(one, (None, 0)))(pieces, path.steps)
+    segments = jnp.arange(path.count.shape[0])
+    return jax.vmap(jax.vmap(one, (None, 0)))(segments, path.steps)
 
 
-def _field(way, seen, duration, piece, row):
+def _field(way, phase_schedule, duration, segment, row):
     def field(u, y, args):
-        tau = torque_at(seen, interval(seen, u) if row is None else row, u)
-        return jnp.stack([y[1], duration**2 * solve(way, piece, y[0], y[1], tau, duration)[2]])
+        tau = torque_at(phase_schedule, interval(phase_schedule, u) if row is None else row, u)
+        return jnp.stack([y[1], duration**2 * solve(way, segment, y[0], y[1], tau, duration)[2]])
 
     return dfx.ODETerm(field)
 
 
-def _until(way, seen, duration, solver, tolerance, max_steps, piece, share, y):
+def _until(way, phase_schedule, duration, solver, tolerance, max_steps, segment, share, y):
     """Steps until the first that passes the piece's end, or to the end of time."""
     errors = dfx.PIDController(rtol=tolerance, atol=tolerance)
     return dfx.diffeqsolve(
-        _field(way, seen, duration, piece, None),
+        _field(way, phase_schedule, duration, segment, None),
         solver,
         jnp.minimum(share, 1 - 1e-9),
         1.0,
         1 / 32,
         y,
         saveat=dfx.SaveAt(steps=True),
-        stepsize_controller=dfx.ClipStepSizeController(errors, step_ts=seen.share),
-        event=dfx.Event(lambda t, y, args, **_: y[0] > way.breaks[piece + 1]),
+        stepsize_controller=dfx.ClipStepSizeController(errors, step_ts=phase_schedule.phase_time),
+        event=dfx.Event(lambda t, y, args, **_: y[0] > way.breakpoints[segment + 1]),
         adjoint=dfx.DirectAdjoint(),
         max_steps=max_steps,
         throw=False,
     )
 
 
-def _land(way, seen, duration, solver, piece, before, end, goal):
+def _land(way, phase_schedule, duration, solver, segment, before, end, goal):
     """The step from `before` with the length, found by Newton's method, that lands on `s = goal`."""
     share, y = before[0], before[1:]
-    term = _field(way, seen, duration, piece, interval(seen, (share + end) / 2))
+    term = _field(way, phase_schedule, duration, segment, interval(phase_schedule, (share + end) / 2))
     solver = eqx.tree_at(lambda x: x.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)
 
     def step(length):

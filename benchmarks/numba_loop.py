@@ -46,13 +46,21 @@ class Motion(NamedTuple):
     evaluations: int
 
 
-def arrays(table, seen) -> tuple[np.ndarray, ...]:
+def arrays(dynamics, phase_schedule) -> tuple[np.ndarray, ...]:
     """A table and a torque window as the NumPy arrays that `simulate_motion` wants."""
-    polynomials = np.ascontiguousarray(np.asarray(table.acceleration))
-    whole = (np.asarray(a).astype(np.int64) for a in (table.first, table.panels))
-    reals = (np.asarray(a) for a in (table.breaks, table.factor))
-    schedule = (np.asarray(a) for a in (seen.share, seen.values, seen.slope))
-    return polynomials, *whole, *reals, int(table.count), *schedule, int(seen.first), int(seen.last)
+    polynomials = np.ascontiguousarray(np.asarray(dynamics.acceleration))
+    whole = (np.asarray(a).astype(np.int64) for a in (dynamics.first, dynamics.panels))
+    reals = (np.asarray(a) for a in (dynamics.breakpoints, dynamics.speed_ratio))
+    schedule = (np.asarray(a) for a in (phase_schedule.phase_time, phase_schedule.values, phase_schedule.slope))
+    return (
+        polynomials,
+        *whole,
+        *reals,
+        int(dynamics.count),
+        *schedule,
+        int(phase_schedule.first),
+        int(phase_schedule.last),
+    )
 
 
 def move(given, duration: float, method: Tableau, tolerance: float, max_steps: int = 4096) -> Motion:
@@ -81,9 +89,9 @@ def _bend(polynomials, first, panels, low, high, s, w, tau1, tau2, duration):
 
 
 @numba.njit(cache=True)
-def _step(polynomials, piece, torque, duration, method, share, s, w, length, ks, kw):
+def _step(polynomials, segment, torque, duration, method, share, s, w, length, ks, kw):
     """One step; the stages' slopes stand in `ks`, `kw`, the first of them already. Returns `s`, `w`, errors."""
-    first, panels, low, high = piece
+    first, panels, low, high = segment
     tau1, tau2, rate1, rate2, begin = torque
     stages = method.b.shape[0]
     for i in range(1, stages):
@@ -107,10 +115,10 @@ def _step(polynomials, piece, torque, duration, method, share, s, w, length, ks,
 @numba.njit(cache=True)
 def loop(given, duration, method, tolerance, nodes):
     """Fill `nodes` with accepted steps; return how many, and the number of evaluations."""
-    polynomials, starts, sizes, breaks, factor, pieces, knots, values, slopes, row, last_row = given
+    polynomials, starts, sizes, breaks, factor, segments, knots, values, slopes, row, last_row = given
     stages = method.b.shape[0]
     ks, kw = np.empty(stages), np.empty(stages)
-    share, s, w, piece, count, evaluations = 0.0, breaks[0], 0.0, 0, 0, 0
+    share, s, w, segment, count, evaluations = 0.0, breaks[0], 0.0, 0, 0, 0
     length, fresh = 1 / 32, True
     nodes[0] = share, s, w
     while share < 1.0 and count < nodes.shape[0] - 1:
@@ -118,7 +126,7 @@ def loop(given, duration, method, tolerance, nodes):
             row += 1
             fresh = True
         torque = (values[row, 0], values[row, 1], slopes[row, 0], slopes[row, 1], knots[row])
-        here = (starts[piece], sizes[piece], breaks[piece], breaks[piece + 1])
+        here = (starts[segment], sizes[segment], breaks[segment], breaks[segment + 1])
         if fresh:
             ago = share - torque[4]
             tau1, tau2 = torque[0] + torque[2] * ago, torque[1] + torque[3] * ago
@@ -138,17 +146,17 @@ def loop(given, duration, method, tolerance, nodes):
         if error > 1:
             length, fresh = taken * grow, False
             continue
-        if s_new > breaks[piece + 1] or w_new < 0:
+        if s_new > breaks[segment + 1] or w_new < 0:
             fitted, used = _land(polynomials, here, torque, duration, method, (share, s, w), taken, s_new, ks, kw)
             evaluations += used
             share, s, w = fitted
             count += 1
             nodes[count] = share, s, w
-            if w <= 0 or piece + 1 >= pieces:
+            if w <= 0 or segment + 1 >= segments:
                 break
-            s = breaks[piece + 1]
-            piece += 1
-            w *= factor[piece]
+            s = breaks[segment + 1]
+            segment += 1
+            w *= factor[segment]
             fresh = True
             continue
         share, s, w = (goal if ends else share + taken), s_new, w_new
@@ -163,18 +171,18 @@ def loop(given, duration, method, tolerance, nodes):
 
 
 @numba.njit(cache=True)
-def _land(polynomials, piece, torque, duration, method, node, longest, s_end, ks, kw):
+def _land(polynomials, segment, torque, duration, method, node, longest, s_end, ks, kw):
     """Newton's method on the length of the step from `node` that ends on the piece's end, or at rest."""
     share, s, w = node
-    high = piece[3]
+    high = segment[3]
     passed = s_end > high
     length = longest / 2
     stages, used = method.b.shape[0], 0
     for _ in range(20):
-        s_new, w_new, _, _ = _step(polynomials, piece, torque, duration, method, share, s, w, length, ks, kw)
+        s_new, w_new, _, _ = _step(polynomials, segment, torque, duration, method, share, s, w, length, ks, kw)
         ago = share + length - torque[4]
         tau1, tau2 = torque[0] + torque[2] * ago, torque[1] + torque[3] * ago
-        bend = _bend(polynomials, piece[0], piece[1], piece[2], high, s_new, w_new, tau1, tau2, duration)
+        bend = _bend(polynomials, segment[0], segment[1], segment[2], high, s_new, w_new, tau1, tau2, duration)
         used += stages
         change = (high - s_new) / w_new if passed else -w_new / bend
         length = min(max(length + change, 0.0), longest)

@@ -96,8 +96,8 @@ def main() -> None:
         return find_references(chosen.knots)
     cases = []
     for plan, scene, durations in _plans(chosen.quick):
-        wa.search(scene)
-        searched = wa.search(scene)
+        wa.search_by_steps(scene)
+        searched = wa.search_by_steps(scene)
         for duration in durations:
             cases.append(_case(plan, _lasting(scene, duration), chosen.knots, searched))
             _print(cases[-1])
@@ -140,7 +140,7 @@ def _case(plan: str, scene: wa.Scene, knots: int, searched) -> Case:
     """Run both optimisers on one plan."""
     descended, taken, busy = _optimised(scene, knots)
     duration = float(scene.phases[0].duration)
-    collocated = [collocate(at.table, duration, knots=knots) for at in wa.trace(scene)]
+    collocated = [collocate(at.dynamics, duration, knots=knots) for at in wa.trace(scene)]
     stored = _references()
     known = [
         _recalled(stored, _key(plan, duration, phase.name, knots), float(top.value))
@@ -168,7 +168,7 @@ def _row(descended, bound, collocated: Collocated, searched, reference: float | 
         optimise=descended.margin,
         optimise_status=descended.status.label,
         collocation=collocated.margin,
-        collocation_status=collocated.verdict if collocated.ipopt in CONVERGED else collocated.ipopt,
+        collocation_status=collocated.assessment if collocated.ipopt in CONVERGED else collocated.ipopt,
         claimed=collocated.course.least,
         nearly=collocated.nearly,
         missed=collocated.missed,
@@ -197,12 +197,12 @@ def find_references(knots: int) -> None:
                 key, bound, stored = _key(plan, duration, phase.name, knots), float(top.value), _references()
                 if _recalled(stored, key, bound) is not None:
                     continue
-                coarse = collocate(at.table, duration, knots=knots)
-                found = best_known(at.table, duration, coarse, enough=ENOUGH * bound)
+                coarse = collocate(at.dynamics, duration, knots=knots)
+                found = best_known(at.dynamics, duration, coarse, enough=ENOUGH * bound)
                 stored[key] = {"bound": bound, "margin": found.margin if found.succeeded else None}
                 REFERENCES.parent.mkdir(exist_ok=True)
                 REFERENCES.write_text(json.dumps(stored, indent=1) + "\n")
-                print(f"{key}: {found.margin:.4f} {found.verdict} of {bound:.4f}", flush=True)
+                print(f"{key}: {found.margin:.4f} {found.assessment} of {bound:.4f}", flush=True)
 
 
 def _key(plan: str, duration: float, phase: str, knots: int) -> str:

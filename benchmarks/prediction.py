@@ -46,17 +46,14 @@ from measure import RESULTS, save
 from random_plans import plans as stopping_plans
 
 import wholearm_jax as wa
-from wholearm_jax.core.status import Status
-from wholearm_jax.ensembles.proportion import wilson_interval
-from wholearm_jax.execution.mujoco_model import CONVEX, ContactCompliance
-from wholearm_jax.execution.rollout import ExecutionOutcome, Tolerance, execute, touching_contacts_at
-from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.margin.quasistatic import affine_coefficients
-from wholearm_jax.model.schedule import pad_schedule
-from wholearm_jax.phases.phase import target_configuration
-from wholearm_jax.phases.result import Result
-from wholearm_jax.phases.sampling import sample_phase
-from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
+from wholearm_jax.core import Status
+from wholearm_jax.ensembles import wilson_interval
+from wholearm_jax.execution import CONVEX, ContactCompliance, ExecutionOutcome, Tolerance, execute, touching_contacts_at
+from wholearm_jax.files import to_dict
+from wholearm_jax.margin import affine_coefficients
+from wholearm_jax.model import pad_schedule
+from wholearm_jax.phases import Result, sample_phase, target_configuration
+from wholearm_jax.plotting import LINK_COLOURS as COLOURS
 
 KNOTS, TIMESTEP = 51, 5e-5  # [s]
 TOLERANCE = Tolerance()
@@ -106,7 +103,7 @@ class Predicted(NamedTuple):
 _coefficients = jax.jit(jax.vmap(affine_coefficients, (None, 0)))
 
 
-def predict(scene: wa.Scene, torque: wa.Torque, traced) -> Predicted:
+def predict(scene: wa.Scene, torque: wa.TorqueSchedule, traced) -> Predicted:
     """Simulate a plan and decide, within `TOLERANCE`, whether it holds."""
     result = wa.simulate(scene, torque, traced=traced)
     courses = [_course(result, phase) for phase in result.phases]
@@ -117,7 +114,7 @@ def predict(scene: wa.Scene, torque: wa.Torque, traced) -> Predicted:
     # What follows a phase that fails is not what would happen: its forces do not count.
     known = next((k for k, (a, c) in enumerate(zip(states, lasts, strict=True)) if not (a and c)), len(states) - 1) + 1
     undecided = None in states[:known]
-    failed = [[held.margin for held in phase.holds if held.lost is not None] for phase in result.phases]
+    failed = [[held.margin for held in phase.holds if held.loss_time is not None] for phase in result.phases]
     margins = [min([np.inf if _rests(p) else p.margin, *held]) for p, held in zip(result.phases, failed, strict=True)]
     worst = int(np.argmin(margins[:known]))
     phase, course = result.phases[worst], courses[worst]
@@ -167,7 +164,7 @@ def _bears(phase) -> bool:
 def _lasts(phase, course) -> bool:
     """Whether no contact of a phase would have to pull for `FREE` or longer, while formations do not change."""
     pulls = bool(phase.impulses) and min(phase.impulses) < 0
-    refused = pulls or any(held.lost is not None for held in phase.holds)
+    refused = pulls or any(held.loss_time is not None for held in phase.holds)
     return _bears(phase) or (phase.status is Status.CONTACT_LOST and not refused and _dip(phase, course) < FREE)
 
 
@@ -185,9 +182,11 @@ def _apart(z, phase) -> float:
 def _course(result, phase):
     """A phase at `BOUND_PLACES` times until its motion ends, also beyond the loss of a contact."""
     outcome, motion = phase.outcome, phase.outcome.motion
-    shares = jnp.linspace(0.0, motion.share[motion.count], PLACES)
+    shares = jnp.linspace(0.0, motion.phase_time[motion.count], PLACES)
     schedule = pad_schedule(result.torque)
-    return jax.device_get(sample_phase(phase.traced.table, schedule, outcome.start, outcome.duration, motion, shares))
+    return jax.device_get(
+        sample_phase(phase.traced.dynamics, schedule, outcome.start, outcome.duration, motion, shares)
+    )
 
 
 def _arrives(phase, course, last: bool) -> bool | None:
@@ -197,8 +196,8 @@ def _arrives(phase, course, last: bool) -> bool | None:
     model begins the next phase where its wire begins, and the object is not there yet.
     """
     motion = phase.outcome.motion
-    ended, length = Status(int(motion.status)), float(phase.traced.table.length)
-    share, pace = (float(values[int(motion.count)]) for values in (motion.share, motion.w / length))
+    ended, length = Status(int(motion.status)), float(phase.traced.dynamics.length)
+    share, pace = (float(values[int(motion.count)]) for values in (motion.phase_time, motion.w / length))
     if {ended, phase.status} & UNDECIDED:
         return None
     off = _off(phase, course)
@@ -218,32 +217,32 @@ def _arrives(phase, course, last: bool) -> bool | None:
 # --- torques ----------------------------------------------------------------------------------------------------------
 
 
-def base_torques(scene: wa.Scene, traced, optimised: bool) -> wa.Torque:
+def base_torques(scene: wa.Scene, traced, optimised: bool) -> wa.TorqueSchedule:
     """The optimised or the quasi-static torques of a plan."""
     if optimised:
         return wa.optimise(scene, knots=KNOTS, traced=traced).torque
     return wa.quasistatic(scene, knots=KNOTS, traced=traced)
 
 
-def spoiled(base: Predicted, rng: np.random.Generator) -> tuple[str, wa.Torque] | None:
+def spoiled(base: Predicted, rng: np.random.Generator) -> tuple[str, wa.TorqueSchedule] | None:
     """A variant of the torques, and which kind it is; None where the drawn squeeze does not reach its aim."""
     torque, row_of = base.result.torque, _rows(base.result)
     change = np.zeros((len(torque.times), 2))
     chosen = int(rng.choice([k for k, phase in enumerate(base.result.phases) if not _rests(phase)]))
     rows = row_of == chosen
-    course, table = base.courses[chosen], base.result.phases[chosen].traced.table
+    course, dynamics = base.courses[chosen], base.result.phases[chosen].traced.dynamics
     s = np.interp(np.asarray(torque.times)[rows], course.time, course.s)
-    pull = np.asarray(_coefficients(table, jnp.asarray(np.resize(s, 4 * KNOTS)))[0])[: rows.sum(), 3:]
+    pull = np.asarray(_coefficients(dynamics, jnp.asarray(np.resize(s, 4 * KNOTS)))[0])[: rows.sum(), 3:]
     if rng.random() < PUSHES:
         duration, size = float(base.result.phases[chosen].duration), (pull**2).sum(1, keepdims=True)
-        back = 2 * rng.uniform(*SHORT) * float(table.length) / duration**2
+        back = 2 * rng.uniform(*SHORT) * float(dynamics.length) / duration**2
         change[rows] = -back * pull / size
-        return "push", wa.Torque(torque.times, torque.values + change)
+        return "push", wa.TorqueSchedule(torque.times, torque.values + change)
     amount = _squeeze(base, chosen, rng)
     if amount is None:
         return None
     change[rows] = amount * np.stack([-pull[:, 1], pull[:, 0]], axis=1) / np.linalg.norm(pull, axis=1, keepdims=True)
-    return "squeeze", wa.Torque(torque.times, torque.values + change)
+    return "squeeze", wa.TorqueSchedule(torque.times, torque.values + change)
 
 
 def _rows(result: Result) -> np.ndarray:
@@ -257,7 +256,7 @@ def _rows(result: Result) -> np.ndarray:
 def _squeeze(base: Predicted, chosen: int, rng: np.random.Generator) -> float | None:
     """How much squeeze, in a direction drawn, moves the least force of a phase to a place drawn about zero."""
     course, phase = base.courses[chosen], base.result.phases[chosen]
-    motion, force = (np.asarray(a) for a in _coefficients(phase.traced.table, jnp.asarray(course.s)))
+    motion, force = (np.asarray(a) for a in _coefficients(phase.traced.dynamics, jnp.asarray(course.s)))
     free = np.stack([-motion[:, 4], motion[:, 3]], axis=1) / np.linalg.norm(motion[:, 3:], axis=1, keepdims=True)
     count = np.isfinite(course.cn).all(0).sum() if np.isfinite(course.cn).any() else 4
     slope = np.einsum("pit,pt->pi", force[:, :count, 3:], free)
@@ -285,7 +284,9 @@ def _squeeze(base: Predicted, chosen: int, rng: np.random.Generator) -> float | 
 # --- executions -------------------------------------------------------------------------------------------------------
 
 
-def executed(predicted: Predicted, timestep: float = TIMESTEP, softness: ContactCompliance = ContactCompliance()) -> dict:
+def executed(
+    predicted: Predicted, timestep: float = TIMESTEP, softness: ContactCompliance = ContactCompliance()
+) -> dict:
     """One execution: whether it holds, where its phases end, and the longest time that a contact was open."""
     done = execute(predicted.result, timestep=timestep, softness=softness, tolerance=TOLERANCE)
     closed = touching_contacts_at(predicted.result.scene, done.names, done.course.z, OPEN)
@@ -412,7 +413,7 @@ def _sensitive(predicted: Predicted) -> bool:
     result = predicted.result
     traced = tuple(phase.traced for phase in result.phases)
     for factor in (1 - NUDGE, 1 + NUDGE):
-        torque = wa.Torque(result.torque.times, factor * result.torque.values)
+        torque = wa.TorqueSchedule(result.torque.times, factor * result.torque.values)
         other = wa.simulate(result.scene, torque, traced=traced)
         for one, phase in zip(predicted.courses, other.phases, strict=True):
             moved = np.asarray(_course(other, phase).z[-1] - one.z[-1])

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 import wholearm_jax as wa
-from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.phases.phase import describe_end
+from wholearm_jax.files import to_dict
+from wholearm_jax.phases import describe_end
 
 VERTICES = (5, 9)  # least and most
 RADIUS = (0.034, 0.048)  # of the circle that the vertices lie in or near [m]
@@ -159,8 +159,8 @@ def _held_to(plan: dict[str, Any], coordinate: int, least: float) -> str | None:
     """Why the last phase ends, if it can be followed and held over at least `plan_margin` of a coordinate; else None."""
     scene = wa.parse(plan)
     traced = wa.trace(scene)
-    wire, table = traced[-1].wire, traced[-1].table
-    if int(table.status) or abs(float(wire.end[coordinate] - wire.start[coordinate])) < least:
+    path, dynamics = traced[-1].path, traced[-1].dynamics
+    if int(dynamics.status) or abs(float(path.end[coordinate] - path.start[coordinate])) < least:
         return None
     if not float(wa.bounds(scene, traced=traced)[-1].value) > LEAST_BOUND:
         return None

@@ -19,49 +19,51 @@ import numpy as np
 from work_precision import problems
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import evaluate, locate_panel
-from wholearm_jax.margin.contact_forces import contact_force, minimum_margin
-from wholearm_jax.model.scene import rigid_body
-from wholearm_jax.model.schedule import interval, torque_at
-from wholearm_jax.phases.phase import trace_phase
-from wholearm_jax.phases.sampling import DEFAULT_SAMPLES, sample_phase
-from wholearm_jax.simulation.event_step import path_acceleration
-from wholearm_jax.simulation.integrator import TerminalEvent, integrate_adaptive
-from wholearm_jax.simulation.phase_motion import simulate_motion
-from wholearm_jax.tracing.path import Resolution
+from wholearm_jax.dynamics import evaluate, locate_panel
+from wholearm_jax.margin import contact_force, minimum_margin
+from wholearm_jax.model import interval, rigid_body, torque_at
+from wholearm_jax.phases import DEFAULT_SAMPLES, sample_phase, trace_phase
+from wholearm_jax.simulation import TerminalEvent, integrate_adaptive, path_acceleration, simulate_motion
+from wholearm_jax.tracing import Resolution
 
 COARSE = Resolution(6, 16, 8)
 
 
 @partial(jax.jit, static_argnames="adjoint")
-def moved(table, seen, duration, adjoint="none"):
+def moved(dynamics, phase_schedule, duration, adjoint="none"):
     """The motion alone."""
-    return simulate_motion(table, seen, duration, how=wa.Integration(adjoint=adjoint))
+    return simulate_motion(dynamics, phase_schedule, duration, options=wa.IntegratorOptions(adjoint=adjoint))
 
 
 @jax.jit
-def scored(table, seen, duration):
+def scored(dynamics, phase_schedule, duration):
     """The motion and its margin."""
-    how = wa.Integration()
-    return minimum_margin(table, seen, duration, simulate_motion(table, seen, duration, how=how), how)
+    options = wa.IntegratorOptions()
+    return minimum_margin(
+        dynamics,
+        phase_schedule,
+        duration,
+        simulate_motion(dynamics, phase_schedule, duration, options=options),
+        options,
+    )
 
 
 @partial(jax.jit, static_argnames="stop")
-def bare(table, seen, duration, stop=False):
+def bare(dynamics, phase_schedule, duration, stop=False):
     """One stage on the wire's first piece; `stop` looks for the first tensile force at every step's end."""
 
     def field(u, y, _):
-        tau = torque_at(seen, interval(seen, u), u)
+        tau = torque_at(phase_schedule, interval(phase_schedule, u), u)
         v = y[1] / duration
-        panel, xi = locate_panel(table, 0, y[0])
+        panel, xi = locate_panel(dynamics, 0, y[0])
         terms = jnp.stack([jnp.ones_like(v), v**2, v, *tau])
-        return jnp.stack([y[1], duration**2 * (evaluate(table.acceleration, panel, xi) * terms).sum()])
+        return jnp.stack([y[1], duration**2 * (evaluate(dynamics.acceleration, panel, xi) * terms).sum()])
 
     def ended(t, y, args, **_):
-        over = y[0] > table.breaks[1]
+        over = y[0] > dynamics.breakpoints[1]
         if stop:
-            row = interval(seen, t)
-            over = over | (contact_force(table, seen, duration, 0, row, t, y[0], y[1]).min() < 0)
+            row = interval(phase_schedule, t)
+            over = over | (contact_force(dynamics, phase_schedule, duration, 0, row, t, y[0], y[1]).min() < 0)
         return over
 
     errors = dfx.PIDController(rtol=1e-10, atol=1e-10)
@@ -71,9 +73,9 @@ def bare(table, seen, duration, stop=False):
         0.0,
         1.0,
         1 / 32,
-        jnp.stack([table.breaks[0], jnp.zeros(())]),
+        jnp.stack([dynamics.breakpoints[0], jnp.zeros(())]),
         saveat=dfx.SaveAt(steps=True),
-        stepsize_controller=dfx.ClipStepSizeController(errors, step_ts=seen.share),
+        stepsize_controller=dfx.ClipStepSizeController(errors, step_ts=phase_schedule.phase_time),
         event=dfx.Event(ended),
         adjoint=dfx.DirectAdjoint(),
         max_steps=256,
@@ -82,53 +84,64 @@ def bare(table, seen, duration, stop=False):
 
 
 @jax.jit
-def stepped(table, seen, duration):
+def stepped(dynamics, phase_schedule, duration):
     """The same stage with all terms, by the package's own loop."""
 
     def field(u, y, row):
-        return jnp.stack([y[1], path_acceleration(table, seen, duration, 0, row, u, y[0], y[1])])
+        return jnp.stack([y[1], path_acceleration(dynamics, phase_schedule, duration, 0, row, u, y[0], y[1])])
 
-    y, final = jnp.stack([table.breaks[0], jnp.zeros(())]), jnp.ones(())
-    stop = TerminalEvent(lambda y: y[0] > table.breaks[1], lambda *_: jnp.asarray(False))  # as much is watched there
-    return integrate_adaptive(field, seen, wa.Integration(), 0 * final, final, y, stop, final).y
+    y, final = jnp.stack([dynamics.breakpoints[0], jnp.zeros(())]), jnp.ones(())
+    stop = TerminalEvent(
+        lambda y: y[0] > dynamics.breakpoints[1], lambda *_: jnp.asarray(False)
+    )  # as much is watched there
+    return integrate_adaptive(field, phase_schedule, wa.IntegratorOptions(), 0 * final, final, y, stop, final).y
 
 
 def rows(problem, repeats: int) -> list[dict]:
     """Every comparison on one phase: times of both sides [s] and their ratio."""
-    table, seen, duration = problem.traced.table, problem.seen, problem.duration
+    dynamics, phase_schedule, duration = problem.traced.dynamics, problem.phase_schedule, problem.duration
     scene, phase = problem.scene, problem.scene.phases[problem.phase]
     rough = wa.trace(scene)[problem.phase - 1].end if problem.phase else scene.start
     solid = rigid_body(scene.object)
 
     def prepared(resolution):
-        return trace_phase(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading, resolution)
+        return trace_phase(solid, scene.hand, scene.gravity, phase.formation, rough, phase.target, resolution)
 
     shares = np.linspace(0.0, 1.0, DEFAULT_SAMPLES)
-    motion = moved(table, seen, duration)
-    gradient = jax.jit(jax.value_and_grad(lambda v: _margin(table, seen, duration, v)))
+    motion = moved(dynamics, phase_schedule, duration)
+    gradient = jax.jit(jax.value_and_grad(lambda v: _margin(dynamics, phase_schedule, duration, v)))
     calls = {
-        "tracing, when the wire is known": (lambda: (prepared(Resolution()), scored(table, seen, duration)), "margin"),
+        "tracing, when the wire is known": (
+            lambda: (prepared(Resolution()), scored(dynamics, phase_schedule, duration)),
+            "margin",
+        ),
         "a table of 64 panels, when 16 would do": (lambda: prepared(Resolution()), lambda: prepared(COARSE)),
-        "the margin, when the motion is asked": (lambda: scored(table, seen, duration), "move"),
+        "the margin, when the motion is asked": (lambda: scored(dynamics, phase_schedule, duration), "move"),
         "the trajectory, when the margin is asked": (
             lambda: (
-                scored(table, seen, duration),
-                sample_phase(table, problem.schedule, problem.start, duration, motion, shares),
+                scored(dynamics, phase_schedule, duration),
+                sample_phase(dynamics, problem.schedule, problem.start, duration, motion, shares),
             ),
             "margin",
         ),
-        "the gradient, when the margin is asked": (lambda: gradient(seen.values), "margin"),
-        "repeatable steps, when no reverse mode is asked": (lambda: moved(table, seen, duration, "both"), "move"),
+        "the gradient, when the margin is asked": (lambda: gradient(phase_schedule.values), "margin"),
+        "repeatable steps, when no reverse mode is asked": (
+            lambda: moved(dynamics, phase_schedule, duration, "both"),
+            "move",
+        ),
         "what diffeqsolve provides, when steps are asked": (
-            lambda: bare(table, seen, duration),
-            lambda: stepped(table, seen, duration),
+            lambda: bare(dynamics, phase_schedule, duration),
+            lambda: stepped(dynamics, phase_schedule, duration),
         ),
         "looking for a tensile force at every step": (
-            lambda: bare(table, seen, duration, stop=True),
-            lambda: bare(table, seen, duration),
+            lambda: bare(dynamics, phase_schedule, duration, stop=True),
+            lambda: bare(dynamics, phase_schedule, duration),
         ),
     }
-    base = {"margin": lambda: scored(table, seen, duration), "move": lambda: moved(table, seen, duration)}
+    base = {
+        "margin": lambda: scored(dynamics, phase_schedule, duration),
+        "move": lambda: moved(dynamics, phase_schedule, duration),
+    }
     compared = []
     for name, (with_it, without) in calls.items():
         without = base[without] if isinstance(without, str) else without
@@ -137,11 +150,16 @@ def rows(problem, repeats: int) -> list[dict]:
     return compared
 
 
-def _margin(table, seen, duration, values):
-    how = wa.Integration(adjoint="both")
-    slope = jnp.diff(values, axis=0) / jnp.where(jnp.diff(seen.share) > 0, jnp.diff(seen.share), 1.0)[:, None]
-    changed = eqx.tree_at(lambda w: (w.values, w.slope), seen, (values, slope))
-    return minimum_margin(table, changed, duration, simulate_motion(table, changed, duration, how=how), how).margin
+def _margin(dynamics, phase_schedule, duration, values):
+    options = wa.IntegratorOptions(adjoint="both")
+    slope = (
+        jnp.diff(values, axis=0)
+        / jnp.where(jnp.diff(phase_schedule.phase_time) > 0, jnp.diff(phase_schedule.phase_time), 1.0)[:, None]
+    )
+    changed = eqx.tree_at(lambda w: (w.values, w.slope), phase_schedule, (values, slope))
+    return minimum_margin(
+        dynamics, changed, duration, simulate_motion(dynamics, changed, duration, options=options), options
+    ).margin
 
 
 def main() -> None:

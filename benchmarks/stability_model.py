@@ -46,10 +46,10 @@ def centroid_and_inertia(vertices, count):
     p = vertices - vertices[:, :1]
     real = (np.arange(p.shape[1] - 1) + 1 < count[:, None]) & (np.arange(p.shape[1] - 1) > 0)
     a, b = p[:, :-1], p[:, 1:]
-    piece = np.where(real, a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], 0.0) / 2
-    area = piece.sum(1)
-    centroid = (piece[..., None] * (a + b)).sum(1) / 3 / area[:, None]
-    second = (piece * ((a * a).sum(2) + (a * b).sum(2) + (b * b).sum(2))).sum(1) / 6
+    segment = np.where(real, a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], 0.0) / 2
+    area = segment.sum(1)
+    centroid = (segment[..., None] * (a + b)).sum(1) / 3 / area[:, None]
+    second = (segment * ((a * a).sum(2) + (a * b).sum(2) + (b * b).sum(2))).sum(1) / 6
     return vertices[:, 0] + centroid, second / area - (centroid**2).sum(1)
 
 

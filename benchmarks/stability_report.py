@@ -104,14 +104,14 @@ def report(double, single, seed, seconds, *, keep):
         "limits": {"float64": DOUBLE._asdict(), "float32": SINGLE._asdict()},
         "quantiles": QUANTILES,
     }
-    table(result)
+    dynamics(result)
     print(f"{seconds:.0f} s")
     if keep:
         save("stability", result)
         draw(result).savefig(RESULTS / "stability.svg")
 
 
-def table(result):
+def dynamics(result):
     """Print counts and residuals."""
     for precision in ("float64", "float32"):
         part = result[precision]

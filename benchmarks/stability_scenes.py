@@ -199,9 +199,9 @@ def closed(shape: Shape, x, phi) -> Closed:
     valid = (where > shape.joint[:, 1, :1]) & (where < shape.joint[:, 0, :1])
     theta, kind, feature = [], [np.zeros_like(low)], [low]
     for finger, mirror in ((0, 1.0), (1, -1.0)):
-        seen = points - shape.joint[:, None, None, finger]
-        seen = seen * np.array([mirror, 1.0])
-        angle, k, f = _close(seen, real, shape.count, shape.length[:, finger], shape.offset[:, finger])
+        phase_schedule = points - shape.joint[:, None, None, finger]
+        phase_schedule = phase_schedule * np.array([mirror, 1.0])
+        angle, k, f = _close(phase_schedule, real, shape.count, shape.length[:, finger], shape.offset[:, finger])
         theta.append(np.where(mirror > 0, angle, np.pi - angle))
         kind.append(k)
         feature.append(f)

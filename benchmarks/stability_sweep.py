@@ -14,9 +14,9 @@ from stability_model import Model, dot
 from stability_programs import FLOATS, GAUSS, follower, forward, reverse, tracer
 from stability_scenes import Scenes, draw
 
-from wholearm_jax.core.config import configure
-from wholearm_jax.simulation.integrator import IntegratorOptions
-from wholearm_jax.tracing.path import Resolution
+from wholearm_jax.core import configure
+from wholearm_jax.simulation import IntegratorOptions
+from wholearm_jax.tracing import Resolution
 
 REASONS = (
     "",
@@ -35,7 +35,7 @@ NONE, APART, MISPLACED, STILL, RANK, WEDGED, ASTRAY, COARSE, LONG = range(len(RE
 class Level(NamedTuple):
     """How finely wires are tabulated, steps and tolerance of a phase, and how many scenes share a program's run."""
 
-    pieces: int
+    segments: int
     panels: int
     steps: int
     tolerance: float
@@ -91,20 +91,20 @@ def swept(scenes: Scenes, precision: Precision) -> dict[str, np.ndarray]:
     for number, level in enumerate(precision.levels):
         final = number == len(precision.levels) - 1
         later, ready = [], []
-        for some, wires, tables in traced(scenes, rows, level):
-            full = tables.count >= level.pieces
+        for some, paths, tables in traced(scenes, rows, level):
+            full = tables.count >= level.segments
             coarse = (tables.status == 0) & ~(tables.error <= precision.coarse)
             again = (full | coarse) & (not final) & (level.panels < precision.levels[-1].panels)
             status = np.where((tables.status == 0) & (full | coarse), checks.NO_CONVERGENCE, tables.status)
             later.append(some[again])
             refused = ~again & (status != 0)
-            refuse(found, scenes, some, wires, tables, status, refused, precision.limits)
+            refuse(found, scenes, some, paths, tables, status, refused, precision.limits)
             good = np.flatnonzero(~again & (status == 0))
-            ready.append((some[good], picked(wires, good), picked(tables, good)))
+            ready.append((some[good], picked(paths, good), picked(tables, good)))
         found["level"][rows] = number
         for stepped in (False, True):
-            for some, wires, tables in regrouped(ready, scenes, stepped, level.lanes):
-                later.append(simulate(found, scenes, some, wires, tables, level, stepped, final, precision.limits))
+            for some, paths, tables in regrouped(ready, scenes, stepped, level.lanes):
+                later.append(simulate(found, scenes, some, paths, tables, level, stepped, final, precision.limits))
         rows = np.sort(np.concatenate(later))
         if not len(rows):
             break
@@ -146,13 +146,13 @@ def to_device(tree):
 
 def traced(scenes, rows, level):
     """Wires and tables of some scenes, batch by batch, as NumPy."""
-    program = tracer(Resolution(level.pieces, level.panels, 8))
+    program = tracer(Resolution(level.segments, level.panels, 8))
     for batch, real in batches(len(rows), level.lanes):
         some = rows[batch]
-        wires, tables = program(to_device(Scenes(*scenes[some])))
+        paths, tables = program(to_device(Scenes(*scenes[some])))
         some = some[:real]
-        wires, tables = jax.tree.map(lambda a, real=real: np.asarray(a)[:real], (wires, tables))
-        yield some, wires, tables
+        paths, tables = jax.tree.map(lambda a, real=real: np.asarray(a)[:real], (paths, tables))
+        yield some, paths, tables
 
 
 def regrouped(ready, scenes, stepped, lanes):
@@ -160,11 +160,11 @@ def regrouped(ready, scenes, stepped, lanes):
     if not ready:
         return
     rows = np.concatenate([some for some, _, _ in ready])
-    wires, tables = (jax.tree.map(lambda *a: np.concatenate(a), *[part[k] for part in ready]) for k in (1, 2))
+    paths, tables = (jax.tree.map(lambda *a: np.concatenate(a), *[part[k] for part in ready]) for k in (1, 2))
     mine = np.flatnonzero(scenes.stepped[rows] == stepped)
     for batch, real in batches(len(mine), lanes):
         at = mine[batch]
-        yield (rows[at], real), picked(wires, at), picked(tables, at)
+        yield (rows[at], real), picked(paths, at), picked(tables, at)
 
 
 # --- refusals --------------------------------------------------------------------------------------------------------
@@ -175,15 +175,15 @@ def flag(found, rows, name, wrong):
     found["violations"][rows] |= np.where(wrong, 1 << checks.VIOLATIONS.index(name), 0)
 
 
-def refuse(found, scenes, some, wires, tables, status, which, limits):
+def refuse(found, scenes, some, paths, tables, status, which, limits):
     """Record scenes without a table, and whether the status has a reason."""
     at = np.flatnonzero(which)
     if not len(at):
         return
-    rows, wires, tables, status = some[at], picked(wires, at), picked(tables, at), status[at]
+    rows, paths, tables, status = some[at], picked(paths, at), picked(tables, at), status[at]
     some = scenes[rows]
     model = Model.of(some)
-    start = np.asarray(wires.start, float)
+    start = np.asarray(paths.start, float)
     finite = np.isfinite(start).all(1)
     start = np.where(finite[:, None], start, 0.0)
     heading = np.zeros_like(start)
@@ -197,9 +197,9 @@ def refuse(found, scenes, some, wires, tables, status, which, limits):
             status == checks.MAX_STEPS,
             ~touching & (status != checks.SINGULAR),
             touching & (status == checks.SINGULAR) & still,
-            (status == checks.SINGULAR) & (wires.status == 0),
+            (status == checks.SINGULAR) & (paths.status == 0),
             status == checks.SINGULAR,
-            wires.status == 0,
+            paths.status == 0,
         ],
         [MISPLACED, LONG, APART, STILL, WEDGED, RANK, COARSE],
         ASTRAY,
@@ -221,55 +221,55 @@ def refuse(found, scenes, some, wires, tables, status, which, limits):
     wedge = np.zeros(len(at), bool)
     some_wedged = np.flatnonzero(reason == WEDGED)
     if len(some_wedged):
-        wedge[some_wedged] = wedged(model.take(some_wedged), picked(wires, some_wedged))
+        wedge[some_wedged] = wedged(model.take(some_wedged), picked(paths, some_wedged))
     flag(found, rows, "singular without a reason", ((reason == RANK) & ~lost) | ((reason == WEDGED) & ~wedge))
     found["status"][rows], found["table_status"][rows], found["reason"][rows] = status, status, reason
     found["condition"][rows], found["table_error"][rows] = tables.condition, tables.error
     found["pieces"][rows] = tables.count
 
 
-def wedged(model, wires):
+def wedged(model, paths):
     """Whether friction wedges the object at a node of its wire, by the other model."""
-    nodes = np.asarray(wires.nodes, float)
+    nodes = np.asarray(paths.nodes, float)
     lanes, panels, count, _ = nodes.shape
-    owner = np.repeat(wires.owner, count, axis=1)[:, :, None]
-    signs = [np.take_along_axis(np.asarray(s, float), owner, axis=1) for s in (wires.slip_sign, wires.joint_sign)]
-    toward = np.take_along_axis(np.asarray(wires.chart, float), owner, axis=1)
+    owner = np.repeat(paths.owner, count, axis=1)[:, :, None]
+    signs = [np.take_along_axis(np.asarray(s, float), owner, axis=1) for s in (paths.slip_sign, paths.joint_sign)]
+    toward = np.take_along_axis(np.asarray(paths.chart, float), owner, axis=1)
     return checks.wedged(model, nodes.reshape(lanes, panels * count, 5), toward, signs[0])
 
 
 # --- motions ---------------------------------------------------------------------------------------------------------
 
 
-def simulate(found, scenes, which, wires, tables, level, stepped, final, limits):
+def simulate(found, scenes, which, paths, tables, level, stepped, final, limits):
     """Simulate, check and record a batch; returns the rows that need more steps or a tighter tolerance."""
     rows, real = which
     how = IntegratorOptions(
-        max_steps=level.steps, stages=max(8, level.steps // 128), tolerance=level.tolerance, steps=stepped
+        max_steps=level.steps, max_stages=max(8, level.steps // 128), tolerance=level.tolerance, has_jumps=stepped
     )
-    result = follower(how)(to_device(wires), to_device(tables), to_device(Scenes(*scenes[rows])))
-    wires, tables, result = jax.tree.map(lambda a: np.asarray(a)[:real], (wires, tables, result))
+    result = follower(how)(to_device(paths), to_device(tables), to_device(Scenes(*scenes[rows])))
+    paths, tables, result = jax.tree.map(lambda a: np.asarray(a)[:real], (paths, tables, result))
     rows = rows[:real]
     some = scenes[rows]
     model = Model.of(some)
     units = checks.Units.of(model)
     found["violations"][rows] = 0
-    check_wire(found, rows, some, model, units, wires, tables, result, limits)
+    check_wire(found, rows, some, model, units, paths, tables, result, limits)
     check_motion(found, rows, model, units, result, limits)
     check_rest(found, rows, some, model, units, result, limits)
     found["status"][rows], found["table_status"][rows] = result.status, tables.status
     found["condition"][rows], found["table_error"][rows] = tables.condition, tables.error
-    found["length"][rows] = tables.breaks[:, -1] - tables.breaks[:, 0]
+    found["length"][rows] = tables.breakpoints[:, -1] - tables.breakpoints[:, 0]
     found["travel"][rows] = result.s
     found["moved"][rows] = result.moved
     found["torque"][rows] = result.torque.values
-    found["steps"][rows], found["end_share"][rows] = result.count, result.share
-    found["wire_end"][rows], found["pieces"][rows] = wires.end_why, tables.count
+    found["steps"][rows], found["end_share"][rows] = result.count, result.phase_time
+    found["wire_end"][rows], found["pieces"][rows] = paths.end_reason, tables.count
     again = (result.status == checks.MAX_STEPS) | (found["energy"][rows] > limits.energy)
     return rows[again & (not final)]
 
 
-def check_wire(found, rows, some, model, units, wires, tables, result, limits):
+def check_wire(found, rows, some, model, units, paths, tables, result, limits):
     """The whole length of a wire and its table."""
     along = units.remove(result.along)
     for name, value in checks.wire_residuals(model, along).items():
@@ -286,7 +286,7 @@ def check_wire(found, rows, some, model, units, wires, tables, result, limits):
     flag(found, rows, "contact beyond its feature", found["beyond"][rows] > limits.place)
     flag(found, rows, "link in the object", found["depth"][rows] > limits.place)
     until = some.until_coordinate, some.until_value / units.z[np.arange(len(rows)), some.until_coordinate]
-    real = checks.end_is_real(model, along["z"][:, -1], wires.end_why, wires.end_contact, until, limits.place)
+    real = checks.end_is_real(model, along["z"][:, -1], paths.end_reason, paths.end_contact, until, limits.place)
     flag(found, rows, "end without a cause", ~real)
     first, x = along["z"][:, 0], along["x"][:, 0]
     away = first - some.rough / units.z
@@ -330,7 +330,7 @@ def check_motion(found, rows, model, units, result, limits):
     excess = np.where(moving, margin, 0.0) - np.where(moving, least, 0.0)
     excess /= np.maximum(scale, 1e-300)
     found["margin_excess"][rows] = np.maximum(excess, 0.0)
-    before = within["share"] < np.where(np.isfinite(result.lost), result.lost * (1 - 1e-9), np.inf)[:, None]
+    before = within["share"] < np.where(np.isfinite(result.loss_time), result.loss_time * (1 - 1e-9), np.inf)[:, None]
     early = np.nanmin(np.where(before[..., None], slack, np.nan), axis=(1, 2), initial=np.inf)
     early = np.where(moving & np.isfinite(early), early, 0.0)
     found["tension_missed"][rows] = np.maximum(-early / np.maximum(scale, 1e-300), 0.0)
@@ -353,7 +353,9 @@ def check_gradients(found, scenes, stepped, precision):
     level, limits = precision.levels[0], precision.limits
     good = (found["status"] == checks.OK) & found["moved"] & (found["level"] == 0) & (scenes.stepped == stepped)
     rows = np.flatnonzero(good)
-    how = IntegratorOptions(max_steps=level.steps, stages=8, tolerance=level.tolerance, steps=stepped, adjoint="both")
+    how = IntegratorOptions(
+        max_steps=level.steps, max_stages=8, tolerance=level.tolerance, has_jumps=stepped, adjoint="both"
+    )
     for batch, real in batches(len(rows), DIFFERENTIATED):
         some = to_device(Scenes(*scenes[rows[batch]]))
         floats = {name: getattr(some, name) for name in FLOATS} | {"torque": to_device(found["torque"][rows[batch]])}
@@ -380,7 +382,7 @@ def check_rest(found, rows, some, model, units, result, limits):
     times = some.knots
     value = np.asarray(result.torque.values, float) / units.torque[:, None, None]
     ends = units.remove(result.ends)
-    verdict_at = np.where(result.ended == checks.STUCK, result.rest, result.share)
+    verdict_at = np.where(result.ended == checks.STUCK, result.rest, result.phase_time)
     for name, place, begin, stop, status in (
         ("rest contradicts accelerations", 1, verdict_at, 1.0, result.ended),
         ("departure contradicts accelerations", 0, 0.0 * result.rest, result.departs, None),
@@ -398,7 +400,7 @@ def check_rest(found, rows, some, model, units, result, limits):
             wrong &= result.moved & (result.ended != checks.MAX_STEPS)
         flag(found, rows, name, wrong)
     arrived = (result.ended == checks.LEFT) & ~(np.abs(result.s - result.length) < 1e-6 * result.length)
-    early = (result.ended == checks.OK) & ~(np.abs(result.share - 1) < 1e-6)
+    early = (result.ended == checks.OK) & ~(np.abs(result.phase_time - 1) < 1e-6)
     halted = np.isin(result.ended, (checks.STUCK, checks.REVERSED, checks.AMBIGUOUS)) & ~(result.w == 0)
     flag(found, rows, "end of the motion", arrived | early | halted)
 

@@ -41,17 +41,19 @@ import numba_loop
 import numpy as np
 
 import wholearm_jax as wa
-from wholearm_jax.core.programs import Program
-from wholearm_jax.core.status import Status
-from wholearm_jax.dynamics.path_dynamics import PathDynamics
+from wholearm_jax.core import Program, Status
+from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.files import scene_toml as scene_file
-from wholearm_jax.model.mechanics import scaled_mechanics
-from wholearm_jax.model.scene import rigid_body
-from wholearm_jax.model.schedule import TorqueSchedule, PhaseSchedule, pad_schedule, restrict_to_phase
-from wholearm_jax.phases.phase import TracedPhase, trace_phase, simulate_phase
-from wholearm_jax.phases.sampling import sample_phase
-from wholearm_jax.simulation.integrator import IntegratorOptions
-from wholearm_jax.simulation.phase_motion import Motion, simulate_motion
+from wholearm_jax.model import (
+    PhaseSchedule,
+    TorqueSchedule,
+    pad_schedule,
+    restrict_to_phase,
+    rigid_body,
+    scaled_mechanics,
+)
+from wholearm_jax.phases import TracedPhase, sample_phase, simulate_phase, trace_phase
+from wholearm_jax.simulation import IntegratorOptions, Motion, simulate_motion
 
 HERE = Path(__file__).parent
 PLAIN = (
@@ -96,7 +98,7 @@ class Problem:
     schedule: TorqueSchedule
     start: jax.Array
     duration: jax.Array
-    seen: PhaseSchedule
+    phase_schedule: PhaseSchedule
     stop: float
     follow: Callable | None = None
     reference: Any = None
@@ -116,20 +118,22 @@ def _problem(scene, traced, phase, kind, unreduced, referred) -> Problem:
     given = wa.read_torque(HERE / "data" / f"heptagon_{kind}.csv")
     start, duration = jnp.asarray(float(phase)), jnp.asarray(float(scene.phases[phase].duration))
     schedule = pad_schedule(given)
-    outcome = simulate_phase(traced[phase].table, schedule, start, duration, IntegratorOptions(tolerance=1e-13), "moving")
-    assert not bool(outcome.motion.held[0]), "the references do not wait"
-    end = float(outcome.motion.share[int(outcome.motion.count)])
+    outcome = simulate_phase(
+        traced[phase].dynamics, schedule, start, duration, IntegratorOptions(tolerance=1e-13), "moving"
+    )
+    assert not bool(outcome.motion.at_rest[0]), "the references do not wait"
+    end = float(outcome.motion.phase_time[int(outcome.motion.count)])
     stop = min(STOP.get(kind, 1.0), end)
 
     name = f"{scene.phases[phase].name}, {'31 knots' if kind == 'knots' else 'a straight line'}"
-    seen = jax.jit(restrict_to_phase)(schedule, start, duration)
-    at = (name, scene, phase, traced[phase], schedule, start, duration, seen, stop)
+    phase_schedule = jax.jit(restrict_to_phase)(schedule, start, duration)
+    at = (name, scene, phase, traced[phase], schedule, start, duration, phase_schedule, stop)
     if not referred:
         return Problem(*at)
 
     data = scene_file.to_dict(scene)
     model = unreduced.Model(data, data["phase"][phase]["contacts"])
-    z = np.asarray(traced[phase].wire.start * system_of(scene, phase).configuration_unit)
+    z = np.asarray(traced[phase].path.start * system_of(scene, phase).configuration_unit)
     follow = partial(_follow, model, z, data["phase"][phase]["toward"], given, float(start))
     reference = follow(min(end + 1e-6, 1.0) if kind != "knots" else stop + 1e-6, 1e-13)
     rows = [reference.at(t) for t in np.linspace(0.0, stop * float(duration), 400)]
@@ -177,49 +181,52 @@ class Call:
 
 
 @Program
-def _move(table: PathDynamics, seen: PhaseSchedule, duration, how: wa.Integration) -> Motion:
-    return simulate_motion(table, seen, duration, how=how)
+def _move(dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, options: wa.IntegratorOptions) -> Motion:
+    return simulate_motion(dynamics, phase_schedule, duration, options=options)
 
 
 @Program
-def _moves(table: PathDynamics, seen: PhaseSchedule, durations, how: wa.Integration) -> Motion:
+def _moves(dynamics: PathDynamics, phase_schedule: PhaseSchedule, durations, options: wa.IntegratorOptions) -> Motion:
     """One phase after the other."""
-    return jax.lax.map(lambda duration: simulate_motion(table, seen, duration, how=how), durations)
+    return jax.lax.map(lambda duration: simulate_motion(dynamics, phase_schedule, duration, options=options), durations)
 
 
 @Program
-def _at_steps(table: PathDynamics, schedule, start, duration, motion: Motion):
+def _at_steps(dynamics: PathDynamics, schedule, start, duration, motion: Motion):
     """`z`, `z_dot`, `c_n` at the motion's steps."""
-    there = sample_phase(table, schedule, start, duration, motion, motion.share)
+    there = sample_phase(dynamics, schedule, start, duration, motion, motion.phase_time)
     return there.z, there.z_dot, there.cn
 
 
 def package(problem: Problem, solver: str, tolerance: float):
     """The package; tracing and tabulating once, and again for every run."""
-    table = problem.traced.table
+    dynamics = problem.traced.dynamics
     limit = 256
     while True:
-        how = wa.Integration(tolerance=jnp.asarray(tolerance), solver=SOLVERS[solver], max_steps=limit)
-        motion = _move(table, problem.seen, problem.duration, how)
+        options = wa.IntegratorOptions(tolerance=jnp.asarray(tolerance), solver=SOLVERS[solver], max_steps=limit)
+        motion = _move(dynamics, problem.phase_schedule, problem.duration, options)
         if int(motion.status) != Status.MAX_STEPS or limit >= 16384:
             break
         limit *= 4
     here = (problem.schedule, problem.start, problem.duration)
     count = int(motion.count)
-    rows = (np.asarray(a)[: count + 1] for a in (motion.share, *_at_steps(table, *here, motion)))
+    rows = (np.asarray(a)[: count + 1] for a in (motion.phase_time, *_at_steps(dynamics, *here, motion)))
     scene, phase = problem.scene, problem.scene.phases[problem.phase]
-    solid, rough = jax.jit(rigid_body)(scene.object), problem.traced.wire.start * problem.traced.wire.start.dtype.type(1)
+    solid, rough = (
+        jax.jit(rigid_body)(scene.object),
+        problem.traced.path.start * problem.traced.path.start.dtype.type(1),
+    )
     rough = rough * system_of(scene, problem.phase).configuration_unit
 
     def again():
-        traced = trace_phase(solid, scene.hand, scene.gravity, phase.formation, rough, phase.heading)
-        return simulate_phase(traced.table, *here, how, "moving")
+        traced = trace_phase(solid, scene.hand, scene.gravity, phase.formation, rough, phase.target)
+        return simulate_phase(traced.dynamics, *here, options, "moving")
 
     durations = _durations(problem, MANY)
     calls = {
-        "package": Call(lambda: _move(table, problem.seen, problem.duration, how)),
-        "package, within a program": Call(lambda: _moves(table, problem.seen, durations, how), MANY),
-        "package, run": Call(lambda: simulate_phase(table, *here, how, "moving")),
+        "package": Call(lambda: _move(dynamics, problem.phase_schedule, problem.duration, options)),
+        "package, within a program": Call(lambda: _moves(dynamics, problem.phase_schedule, durations, options), MANY),
+        "package, run": Call(lambda: simulate_phase(dynamics, *here, options, "moving")),
         "package, trace and run": Call(again),
     }
     return error(problem, *rows), count, calls
@@ -232,12 +239,12 @@ def _durations(problem: Problem, count: int):
 
 def between(problem: Problem, tolerance: float) -> dict[str, float]:
     """The error of the sampled trajectory between the steps of the default solver."""
-    how = wa.Integration(tolerance=jnp.asarray(tolerance))
-    motion = _move(problem.traced.table, problem.seen, problem.duration, how)
+    options = wa.IntegratorOptions(tolerance=jnp.asarray(tolerance))
+    motion = _move(problem.traced.dynamics, problem.phase_schedule, problem.duration, options)
     # Beyond the wire's end, which a coarse run reaches a little early, the object rests.
-    last = min(problem.stop, float(motion.share[int(motion.count)]))
+    last = min(problem.stop, float(motion.phase_time[int(motion.count)]))
     shares = jnp.linspace(0.0, last * (1 - 1e-12), 401)
-    here = (problem.traced.table, problem.schedule, problem.start, problem.duration, motion)
+    here = (problem.traced.dynamics, problem.schedule, problem.start, problem.duration, motion)
     there = sample_phase(*here, shares)
     wrong = error(problem, *(np.asarray(a) for a in (shares, there.z, there.z_dot, there.cn)))
     return {"tolerance": tolerance, "error": wrong}
@@ -246,21 +253,23 @@ def between(problem: Problem, tolerance: float) -> dict[str, float]:
 def direct(problem: Problem, solver: str, tolerance: float):
     """Newton's method in the vector field."""
     mechanics = jax.jit(lambda: system_of(problem.scene, problem.phase))()
-    way = newton_in_field.direct(mechanics, problem.traced.wire, problem.traced.table)
+    way = newton_in_field.direct(mechanics, problem.traced.path, problem.traced.dynamics)
     rest, limit = (DIRECT[solver], jnp.asarray(tolerance)), 256
     while True:
-        path = newton_in_field.move(way, problem.seen, problem.duration, *rest, limit)
+        path = newton_in_field.move(way, problem.phase_schedule, problem.duration, *rest, limit)
         if int(path.count.max()) < limit or limit >= 16384:
             break
         limit *= 4
-    found = newton_in_field.states(way, problem.seen, problem.duration, path)
+    found = newton_in_field.states(way, problem.phase_schedule, problem.duration, path)
     live = np.arange(limit) < np.asarray(path.count)[:, None]
     rows = (np.asarray(a)[live] for a in (path.steps[..., 0], *found))
     durations = _durations(problem, FEW)
     calls = {
-        "Newton in the field": Call(lambda: newton_in_field.move(way, problem.seen, problem.duration, *rest, limit)),
+        "Newton in the field": Call(
+            lambda: newton_in_field.move(way, problem.phase_schedule, problem.duration, *rest, limit)
+        ),
         "Newton, within a program": Call(
-            lambda: newton_in_field.moves(way, problem.seen, durations, *rest, limit), FEW
+            lambda: newton_in_field.moves(way, problem.phase_schedule, durations, *rest, limit), FEW
         ),
     }
     return error(problem, *rows), int(path.count.sum()), calls
@@ -280,7 +289,10 @@ def unreduced(problem: Problem, tolerance: float) -> dict:
 
 def bare(problem: Problem, solver: str, tolerance: float):
     """The hand-written loop over the package's own table."""
-    given, method = numba_loop.arrays(problem.traced.table, problem.seen), numba_loop.tableau(SOLVERS[solver])
+    given, method = (
+        numba_loop.arrays(problem.traced.dynamics, problem.phase_schedule),
+        numba_loop.tableau(SOLVERS[solver]),
+    )
     found = numba_loop.move(given, float(problem.duration), method, tolerance)
     share, s, w = found.nodes[: found.count + 1].T
     there = _states(problem, jnp.asarray(share), jnp.asarray(s), jnp.asarray(w))
@@ -293,11 +305,15 @@ def _states(problem: Problem, share, s, w):
     """`z`, `z_dot`, `c_n` of a bare loop's nodes, from the table."""
     rows = share.shape[0]
     count = jnp.asarray(rows - 1)
-    table, seen = problem.traced.table, problem.seen
-    piece = jnp.minimum((s[1:, None] > table.breaks[None, 1:-1]).sum(1), table.count - 1)
-    row = jnp.clip((((share[1:] + share[:-1]) / 2)[:, None] >= seen.share).sum(1) - 1, seen.first, seen.last)
-    motion = Motion(share, s, w, w[:-1], piece, row, jnp.zeros(rows - 1, bool), count, jnp.asarray(0))
-    return _at_steps(table, problem.schedule, problem.start, problem.duration, motion)
+    dynamics, phase_schedule = problem.traced.dynamics, problem.phase_schedule
+    segment = jnp.minimum((s[1:, None] > dynamics.breakpoints[None, 1:-1]).sum(1), dynamics.count - 1)
+    row = jnp.clip(
+        (((share[1:] + share[:-1]) / 2)[:, None] >= phase_schedule.phase_time).sum(1) - 1,
+        phase_schedule.first,
+        phase_schedule.last,
+    )
+    motion = Motion(share, s, w, w[:-1], segment, row, jnp.zeros(rows - 1, bool), count, jnp.asarray(0))
+    return _at_steps(dynamics, problem.schedule, problem.start, problem.duration, motion)
 
 
 # --- runs -------------------------------------------------------------------------------------------------------------
@@ -390,9 +406,9 @@ def _front(rows: list[dict]) -> list[tuple[float, float]]:
     return front
 
 
-def tabulate(table: dict, against: str) -> None:
+def tabulate(dynamics: dict, against: str) -> None:
     """The ratios."""
-    for problem, rows in table.items():
+    for problem, rows in dynamics.items():
         print(f"\n{problem}: time over that of '{against}'" + "".join(f"{e:8.0e}" for e in LEVELS))
         for name, values in rows.items():
             print(f"  {name:40s}" + "".join("       -" if v is None else f"{v:8.3g}" for v in values))
@@ -439,9 +455,9 @@ def main() -> None:
     kept = {"levels": LEVELS, "flags": PLAIN, "ratios": tables, "within a program": within, "runs": runs}
     if not given.quick:
         draw(found, plain, measure.save("work_precision", kept).with_suffix(".svg"))
-    for name, table in tables.items():
+    for name, dynamics in tables.items():
         print(f"\n{name.upper()}")
-        tabulate(table, "package")
+        tabulate(dynamics, "package")
     print("\nCONFIGURED, WITHIN A PROGRAM")
     shown = ("bare loop", "Newton, within a program")
     chosen = {problem: {name: rows[name] for name in shown} for problem, rows in within.items()}

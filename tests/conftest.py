@@ -19,7 +19,7 @@ def pytest_collection_modifyitems(items):
     has compiled it has. Notebooks late, when others have compiled their programs; the many short ones at the end."""
 
     def place(item):
-        late = ("test_notebooks", "test_scene_file")
+        late = ("test_notebooks", "test_scene_toml")
         derived = any(word in item.nodeid for word in ("gradient", "derivatives"))
         return -1 if derived else next((k for k, name in enumerate(late, 1) if name in item.nodeid), 0)
 

@@ -23,7 +23,7 @@ def test_random_plans_can_be_followed_and_held():
 
     (scene,) = random_plans(1, seed=3)
     traced = wa.trace(scene)
-    assert [wa.Status(int(one.table.status)).label for one in traced] == ["ok", "ok"]
+    assert [wa.Status(int(one.dynamics.status)).label for one in traced] == ["ok", "ok"]
     assert min(float(top.value) for top in wa.bounds(scene, traced=traced)) > LEAST_BOUND
 
 
@@ -35,7 +35,7 @@ def test_random_plans_at_speed_lead_on():
 
     scene = wa.load("flight")
     traced = wa.trace(scene)
-    onward = list(chains(scene, traced[0].end, 1, exit_velocity(traced[0].table)))
+    onward = list(chains(scene, traced[0].end, 1, exit_velocity(traced[0].dynamics)))
     assert all(way.status is wa.Status.OK and way.bound > 0 for (way,) in onward)
     for (way,) in onward:
         np.testing.assert_allclose(way.traced.begin, traced[0].end, atol=1e-9)

@@ -1,30 +1,25 @@
 """Differentiable dynamics and torque-trajectory optimisation for planar whole-arm manipulation.
 
-Read the modules in this order: `scene`, `contact_set`, `scaled_mechanics`, `solve_on_path`, `rest_margin`, `trace_curve`, `start`, `places` and `wire`
-(trace), `reduction` (reduce), `schedule`, `stepping`, `landing` and `motion` (simulate), `forces` (score), `verdict`,
+Read the modules in this order: `scene`, `contact_set`, `scaled_mechanics`, `solve_on_path`, `rest_margin`, `trace_curve`, `start`, `places` and `path`
+(trace), `reduction` (reduce), `schedule`, `stepping`, `landing` and `motion` (simulate), `forces` (score), `assessment`,
 `phase`, `result` and `plan`, `squeeze` (quasi-static torques and the bound), `shooting`, `linearisation`, `recursion`,
 `descent`, `pacing`, `initial_guesses` and `optimiser` (optimise), `baseline` (the paper's search), `variation` and `batch`
 (many scenes at once), `build_mujoco_model`, `coulomb`, `execution` and `perturbation` (virtual hardware).
 """
 
-from wholearm_jax.core.config import configure
-from wholearm_jax.core.status import Status
-from wholearm_jax.ensembles.batch import check_batch
-from wholearm_jax.files.results import read_torque, write_torque
-from wholearm_jax.files.scene_toml import load, parse, save
-from wholearm_jax.model.scene import Scene
-from wholearm_jax.model.schedule import TorqueSchedule, torque_schedule
-from wholearm_jax.optimisation.optimiser import bounds, optimise, quasistatic
-from wholearm_jax.optimisation.step_search import search_by_steps
-from wholearm_jax.phases.plan import margin, simulate, trace
-from wholearm_jax.phases.sampling import trajectory
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.core import Status, configure
+from wholearm_jax.ensembles import check
+from wholearm_jax.files import load, parse, read_torque, save, write_torque
+from wholearm_jax.model import Scene, TorqueSchedule, torque_schedule
+from wholearm_jax.optimisation import bounds, optimise, quasistatic, search_by_steps
+from wholearm_jax.phases import margin, simulate, trace, trajectory
+from wholearm_jax.simulation import IntegratorOptions
 
 __all__ = [
-    "Integration",
+    "IntegratorOptions",
     "Scene",
     "Status",
-    "Torque",
+    "TorqueSchedule",
     "bounds",
     "check",
     "configure",
@@ -35,9 +30,9 @@ __all__ = [
     "quasistatic",
     "read_torque",
     "save",
-    "search",
+    "search_by_steps",
     "simulate",
-    "torque",
+    "torque_schedule",
     "trace",
     "trajectory",
     "write_torque",

@@ -18,10 +18,10 @@ from wholearm_jax.cli.arguments import (
     SceneName,
     TorqueFile,
     descent_progress,
+    load_scene,
     make_output_folder,
     phase_number,
     simulate_prediction,
-    load_scene,
     traced_or_refused,
     writing,
 )
@@ -29,8 +29,7 @@ from wholearm_jax.cli.check import ARRIVAL, check, ensemble
 from wholearm_jax.cli.execute import execute
 from wholearm_jax.cli.output import finish, write_report
 from wholearm_jax.cli.robust import optimise_robustly
-from wholearm_jax.core.config import configure
-from wholearm_jax.core.programs import keep_programs
+from wholearm_jax.core import configure, keep_programs
 
 UsageError: Any = typer.BadParameter.__mro__[1]  # of the library beneath, which Typer has under changing names
 
@@ -57,7 +56,7 @@ def main() -> None:
     if sys.argv[1:2] != ["check"]:  # which knows itself how many scenes there are to compile for
         configure()
     _keep_compiled()
-    from wholearm_jax.files.scene_toml import SceneError
+    from wholearm_jax.files import SceneError
 
     try:
         sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False) or 0)
@@ -85,7 +84,7 @@ def _keep_compiled() -> None:
 @app.command()
 def scenes() -> None:
     """List the bundled scenes."""
-    from wholearm_jax.files.scene_toml import bundled, load
+    from wholearm_jax.files import bundled, load
 
     for name in bundled():
         scene = load(name)
@@ -126,8 +125,8 @@ def optimise(
             raise BadInput(f"--robust: knows no --{unknown[0]}")
         optimise_robustly(ensemble(loaded, robust, seed), folder, samples or 64, knots, steps, arrival, report)
     samples = samples or 201
-    from wholearm_jax.optimisation.optimiser import MIN_TRANSITION_SPEED, precompile_optimise
-    from wholearm_jax.optimisation.optimiser import optimise as find
+    from wholearm_jax.optimisation import MIN_TRANSITION_SPEED, precompile_optimise
+    from wholearm_jax.optimisation import optimise as find
 
     begun = time.perf_counter()
     precompile_optimise(loaded, knots=knots)
@@ -146,7 +145,9 @@ def optimise(
         for bar, why in zip(bars, found.stopped, strict=True):
             progress.update(bar, completed=steps, state=why)
     seconds = time.perf_counter() - begun
-    for phase, top, share, why in zip(found.result.phases, found.bounds, found.reached, found.stopped, strict=True):
+    for phase, top, share, why in zip(
+        found.result.phases, found.bounds, found.bound_fraction, found.stopped, strict=True
+    ):
         held = phase.status.value == 0 and 0 < share < float("inf")  # a plan that fails may not come to the hard part
         reached = f", {100 * share:.1f} % of it reached" if held else ""
         print(f"{phase.message}; bound {float(top.value):.4g} N{reached}; stopped: {why}")
@@ -170,10 +171,10 @@ def simulate(
 ) -> None:
     """Simulate a plan under a given torque schedule."""
     loaded = load_scene(scene, set_)
-    from wholearm_jax.core.programs import wait_for
-    from wholearm_jax.files.results import read_torque
-    from wholearm_jax.optimisation.optimiser import bounds
-    from wholearm_jax.phases.plan import precompile_simulate
+    from wholearm_jax.core import wait_for
+    from wholearm_jax.files import read_torque
+    from wholearm_jax.optimisation import bounds
+    from wholearm_jax.phases import precompile_simulate
 
     schedule = read_torque(torque)
     folder = make_output_folder(out)
@@ -201,7 +202,7 @@ def _check_gradient(scene, schedule) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from wholearm_jax.phases.gradient_check import check_gradient
+    from wholearm_jax.phases import check_gradient
 
     try:
         slopes = check_gradient(scene, schedule)
@@ -236,8 +237,8 @@ def formations(
     from rich.console import Console
     from rich.table import Table
 
-    from wholearm_jax.phases.phase import target_configuration
-    from wholearm_jax.planning.successors import exit_velocity, touching_contacts, successor_formations
+    from wholearm_jax.phases import target_configuration
+    from wholearm_jax.planning import exit_velocity, successor_formations, touching_contacts
 
     traced = traced_or_refused(scene, loaded)
     if after is None:
@@ -248,7 +249,7 @@ def formations(
             names = ", ".join(p.name for p in loaded.phases)
             raise BadInput(f"--after {after}: no such phase; phases: {names}")
         z = target_configuration(loaded.phases[row], traced[row])
-        z_dot = None if loaded.phases[row].arrive == "hold" else exit_velocity(traced[row].table)
+        z_dot = None if loaded.phases[row].arrive == "hold" else exit_velocity(traced[row].dynamics)
     found = successor_formations(loaded, z, z_dot)
     table = Table(title=f"touching: {', '.join(touching_contacts(loaded, z))}")
     for column in ("contacts", "toward", "leads to", "length", "static N", "bound N", "enter at speed"):
@@ -260,7 +261,7 @@ def formations(
     Console().print(table)
     print(LEGEND)
     if folder is not None:
-        from wholearm_jax.plotting.plan_figures import draw_successors, save_figure
+        from wholearm_jax.plotting import draw_successors, save_figure
 
         save_figure(lambda: draw_successors(loaded, z, found), folder, "formations")
 
@@ -270,10 +271,9 @@ def search(scene: SceneName, out: Out = None, samples: Samples = 201) -> None:
     """The paper's search for torques by steps of 10 %."""
     loaded = load_scene(scene, None)
     folder = make_output_folder(out)
-    from wholearm_jax.core.programs import wait_for
-    from wholearm_jax.optimisation.optimiser import bounds
-    from wholearm_jax.optimisation.step_search import search_by_steps as look
-    from wholearm_jax.optimisation.step_search import precompile_search
+    from wholearm_jax.core import wait_for
+    from wholearm_jax.optimisation import bounds, precompile_search
+    from wholearm_jax.optimisation import search_by_steps as look
 
     compiled = precompile_search()
     traced = traced_or_refused(scene, loaded)

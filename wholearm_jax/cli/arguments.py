@@ -23,7 +23,7 @@ class BadInput(Exception):
 
 def load_scene(name: str, changes: list[str] | None):
     """Load a scene and apply `--set`."""
-    from wholearm_jax.files.scene_toml import load
+    from wholearm_jax.files import load
 
     scene = load(name)
     for change in changes or ():
@@ -58,7 +58,7 @@ def _progress(*columns):
 def _changed(scene, change: str):
     import equinox as eqx
 
-    from wholearm_jax.model.scene import replace_duration
+    from wholearm_jax.model import replace_duration
 
     key, _, value = change.partition("=")
     phase, _, field = key.rpartition(".")
@@ -87,16 +87,13 @@ def traced_or_refused(name: str, scene):
     """Trace a plan; refuse it, naming the contact, where a formation's contacts cannot all touch where it begins."""
     import numpy as np
 
-    from wholearm_jax.model.contact_kinematics import constraints, contact_kinematics, anchor_rolling
-    from wholearm_jax.model.mechanics import scaled_mechanics
-    from wholearm_jax.model.scene import rigid_body
-    from wholearm_jax.phases.phase import target_configuration
-    from wholearm_jax.phases.plan import trace
+    from wholearm_jax.model import anchor_rolling, constraints, contact_kinematics, rigid_body, scaled_mechanics
+    from wholearm_jax.phases import target_configuration, trace
 
     @jax.jit
-    def apart(formation, z, rough):
+    def apart(formation, z, initial_guess):
         mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, formation)
-        held = anchor_rolling(mechanics.contacts, rough / mechanics.configuration_unit)
+        held = anchor_rolling(mechanics.contacts, initial_guess / mechanics.configuration_unit)
         at, missed = contact_kinematics(held, z), jax.numpy.abs(constraints(held, z))
         beyond = jax.numpy.maximum(0.0, jax.numpy.maximum(held.lower - at.along, at.along - held.upper))
         gap = jax.numpy.where(held.tangential, missed, jax.numpy.hypot(at.gap, beyond))
@@ -104,17 +101,17 @@ def traced_or_refused(name: str, scene):
 
     traced = trace(scene)
     for k, (phase, at) in enumerate(zip(scene.phases, traced, strict=True)):
-        if int(at.table.status) == 0:
+        if int(at.dynamics.status) == 0:
             continue
-        rough = target_configuration(scene.phases[k - 1], traced[k - 1]) if k > 0 else scene.start
-        gap, length, unit = apart(phase.formation, at.wire.start, rough)
+        initial_guess = target_configuration(scene.phases[k - 1], traced[k - 1]) if k > 0 else scene.start
+        gap, length, unit = apart(phase.formation, at.path.start, initial_guess)
         where = "with the others, from this start"
         if k > 0 and not np.any(gap > 1e-6):
-            gap, _, _ = apart(phase.formation, rough / unit, rough)
+            gap, _, _ = apart(phase.formation, initial_guess / unit, initial_guess)
             where = f"where phase '{scene.phases[k - 1].name}' ends"
         if not np.all(gap <= 1e-6):
             worst = int(np.argmax(gap))
-            which = phase.formation.names[phase.formation.contact_of_slot[worst]]
+            which = phase.formation.names[phase.formation.contact_of_row[worst]]
             key, size = f"phase[{k}].contacts", float(gap[worst] * length)
             if phase.formation.tangential[worst]:
                 raise BadInput(f"{name}: {key}: {which} cannot stay in its place {where}: it is off by {size:.3g} m")
@@ -126,14 +123,14 @@ def traced_or_refused(name: str, scene):
 
 def _note_unreached(name: str, scene, traced) -> None:
     """Say where a phase ends before its `until`."""
-    from wholearm_jax.model.scene import COORDINATES
-    from wholearm_jax.tracing.path import UNTIL
+    from wholearm_jax.model import COORDINATES
+    from wholearm_jax.tracing import UNTIL
 
     for k, (phase, at) in enumerate(zip(scene.phases, traced, strict=True)):
-        which = int(phase.heading.until_coordinate)
-        if which >= 0 and int(at.table.status) == 0 and int(at.wire.end_why) != UNTIL:
+        which = int(phase.target.until_coordinate)
+        if which >= 0 and int(at.dynamics.status) == 0 and int(at.path.end_reason) != UNTIL:
             begin, end = (float(z[which]) for z in (at.begin, at.end))
-            wanted = f"{COORDINATES[which]} = {float(phase.heading.until_value):.6g}"
+            wanted = f"{COORDINATES[which]} = {float(phase.target.until_value):.6g}"
             note(f"{name}: phase[{k}].until: {wanted} is not on its wire, which leads from {begin:.6g} to {end:.6g}")
 
 
@@ -144,7 +141,7 @@ def note(text: str) -> None:
 
 def note_limit_violations(scene, schedule, torque: Path) -> None:
     """Say where a schedule asks for more than a joint's torque limit."""
-    from wholearm_jax.model.schedule import limit_violations
+    from wholearm_jax.model import limit_violations
 
     for joint, size, when, limit in limit_violations(schedule, scene.hand.torque_limit):
         note(f"{torque}: |tau{joint}| is {size:.4g} N m at t = {when:.4g} s, beyond the limit of {limit:.4g} N m")
@@ -152,7 +149,7 @@ def note_limit_violations(scene, schedule, torque: Path) -> None:
 
 def simulate_prediction(scene, schedule, torque: Path, tolerance: float, traced):
     """Simulate a plan under a schedule; refuse one from the file `torque` that is too short."""
-    from wholearm_jax.phases.plan import simulate as follow
+    from wholearm_jax.phases import simulate as follow
 
     note_limit_violations(scene, schedule, torque)
     try:

@@ -15,8 +15,16 @@ from typing import Annotated, Any
 
 import typer
 
-from wholearm_jax.cli.arguments import TORQUE, BadInput, SceneName, counting_progress, note, note_limit_violations, writing
-from wholearm_jax.core.config import configure
+from wholearm_jax.cli.arguments import (
+    TORQUE,
+    BadInput,
+    SceneName,
+    counting_progress,
+    note,
+    note_limit_violations,
+    writing,
+)
+from wholearm_jax.core import configure
 
 BESIDE = (".json", ".png", ".svg", ".pdf")  # what stands beside a store, under its name
 MANY = 250_000  # scenes from which on compiling well, which takes 1.5 times as long, pays (`benchmarks/batch.py`)
@@ -55,7 +63,7 @@ def check(
         raise BadInput("check: give --torque FILE, or --optimise")
     if out.suffix in BESIDE:
         raise BadInput(f"--out {out}: {out.suffix} is what stands beside the store; name the store otherwise, as .zarr")
-    from wholearm_jax.files.polygons_npz import how_many, read_polygons
+    from wholearm_jax.files import how_many, read_polygons
 
     many = how_many(polygons) if polygons else count or 0
     configure(compiled="quickly" if many < MANY else "well")
@@ -65,9 +73,9 @@ def check(
         import zarr  # noqa: F401
     except ModuleNotFoundError:
         raise BadInput("checking many scenes needs Zarr: pip install 'wholearm_jax[batch]'") from None
+    from wholearm_jax.files import load
     from wholearm_jax.files.check_store import StoreError, fingerprint, identity
-    from wholearm_jax.files.scene_toml import load
-    from wholearm_jax.phases.plan import require_motion
+    from wholearm_jax.phases import require_motion
 
     loaded = load(scene)
     try:
@@ -135,8 +143,8 @@ class _Job:
 
 def _followed(scene, torque: Path, place: _Place):
     """The schedule that all scenes follow."""
-    from wholearm_jax.files.results import read_torque
-    from wholearm_jax.phases.plan import require_covered
+    from wholearm_jax.files import read_torque
+    from wholearm_jax.phases import require_covered
 
     schedule = read_torque(torque)
     try:
@@ -150,7 +158,7 @@ def _followed(scene, torque: Path, place: _Place):
 
 def ensemble(scene, amounts: list[str] | None, seed: int):
     """The ensemble that `QUANTITY=AMOUNT` arguments describe."""
-    from wholearm_jax.ensembles.ensemble import make_ensemble
+    from wholearm_jax.ensembles import make_ensemble
 
     pairs = [text.partition("=") for text in amounts or ()]
     try:
@@ -217,7 +225,7 @@ def _fill(store, job: _Job, place: _Place) -> None:
 
 
 def _checked(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
-    from wholearm_jax.ensembles.batch import check_in_chunks
+    from wholearm_jax.ensembles import check_in_chunks
 
     settings = {"tolerance": job.settings["tolerance"], "arrival": job.settings["arrival"]}
     parts = check_in_chunks(job.source, job.torque, job.count, chunk=job.chunk, wanted=missing, **settings)
@@ -232,8 +240,8 @@ def _optimised(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
     import jax
     import numpy as np
 
-    from wholearm_jax.ensembles.batch import BatchResult, from_result
-    from wholearm_jax.optimisation.optimiser import optimise
+    from wholearm_jax.ensembles import BatchResult, from_result
+    from wholearm_jax.optimisation import optimise
 
     def one(number):
         found = optimise(job.source.draw(number), knots=job.knots)
@@ -255,11 +263,9 @@ def _report(store, scene, source, out: Path):
     import jax
     import numpy as np
 
-    from wholearm_jax.core.atomic_files import write_atomically
-    from wholearm_jax.ensembles.ensemble import Ensemble
-    from wholearm_jax.ensembles.summary import rank_correlations, most_influential, summarise
-    from wholearm_jax.plotting.ensemble_figures import draw_ensemble
-    from wholearm_jax.plotting.plan_figures import save_figure
+    from wholearm_jax.core import write_atomically
+    from wholearm_jax.ensembles import Ensemble, most_influential, rank_correlations, summarise
+    from wholearm_jax.plotting import draw_ensemble, save_figure
 
     told = summarise(scene, (store.read(k) for k in range(store.chunks)), store.count)
     shown, more = (), {}

@@ -14,9 +14,9 @@ from wholearm_jax.cli.arguments import (
     SceneName,
     TorqueFile,
     counting_progress,
+    load_scene,
     make_output_folder,
     simulate_prediction,
-    load_scene,
     traced_or_refused,
     writing,
 )
@@ -43,15 +43,14 @@ def execute(
     shares = _share("--friction", friction), _share("--mass", mass)
     loaded = load_scene(scene, None)
     try:
-        from wholearm_jax.execution.rollout import ExecutionOutcome, Tolerance, require_wires
-        from wholearm_jax.execution.rollout import execute as drive
-        from wholearm_jax.execution.trials import Amounts, require_objects
-        from wholearm_jax.execution.trials import run_trials as drive_perturbed
+        from wholearm_jax.execution import Amounts, ExecutionOutcome, Tolerance, require_objects, require_wires
+        from wholearm_jax.execution import execute as drive
+        from wholearm_jax.execution import run_trials as drive_perturbed
     except ModuleNotFoundError as error:
         if error.name not in ("mujoco", "joblib"):
             raise
         raise BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
-    from wholearm_jax.files.results import read_torque
+    from wholearm_jax.files import read_torque
 
     schedule, amounts = read_torque(torque), Amounts(*shares, geometry, start)
     if perturb:
@@ -97,7 +96,7 @@ def _share(option: str, text: str) -> float:
 @contextmanager
 def _progress(count: int) -> Iterator[Callable]:
     """A bar on the terminal while perturbed executions run, to be called with each that is done."""
-    from wholearm_jax.execution.rollout import ExecutionOutcome
+    from wholearm_jax.execution import ExecutionOutcome
 
     with counting_progress("{task.fields[succeed]} succeed") as progress:
         bar, succeed = progress.add_task("perturbed executions", total=count, succeed=0), 0
@@ -112,8 +111,8 @@ def _progress(count: int) -> Iterator[Callable]:
 
 def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> None:
     """Write an execution's files."""
-    from wholearm_jax.core.atomic_files import write_atomically
-    from wholearm_jax.files.results import discard_execution, execution_summary, write_execution, write_summary
+    from wholearm_jax.core import write_atomically
+    from wholearm_jax.files import discard_execution, execution_summary, write_execution, write_summary
 
     with writing(f"--out {folder}"):
         discard_execution(folder)
@@ -126,9 +125,8 @@ def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> Non
 def _draw_execution(done, folder: Path, video: bool) -> None:
     import matplotlib.pyplot as plt
 
-    from wholearm_jax.core.atomic_files import write_atomically
-    from wholearm_jax.plotting.execution_figures import animate, draw_execution, draw_execution_strip
-    from wholearm_jax.plotting.plan_figures import save_figure
+    from wholearm_jax.core import write_atomically
+    from wholearm_jax.plotting import animate, draw_execution, draw_execution_strip, save_figure
 
     save_figure(lambda: draw_execution(done), folder, "execution")
     if video:

@@ -16,7 +16,7 @@ def finish(result, folder: Path | None, samples: int, report: bool = False, **mo
 def write_result(result, folder: Path | None, samples: int, report: bool = False, **more) -> None:
     """Write the files, in place of those of an earlier result, and say what became of the plan."""
     if folder is not None:
-        from wholearm_jax.files.results import discard, summary, write_summary, write_torque, write_trajectory
+        from wholearm_jax.files import discard, summary, write_summary, write_torque, write_trajectory
 
         with writing(f"--out {folder}"):
             discard(folder)
@@ -31,15 +31,15 @@ def write_result(result, folder: Path | None, samples: int, report: bool = False
 
 def write_report(folder: Path, path: Path) -> None:
     """Write a result folder's page."""
-    from wholearm_jax.core.atomic_files import write_atomically
-    from wholearm_jax.report.page import report as page
+    from wholearm_jax.core import write_atomically
+    from wholearm_jax.report import report as page
 
     write_atomically(path, page(folder))
 
 
 def _draw(result, folder: Path) -> None:
-    from wholearm_jax.phases.sampling import trajectory
-    from wholearm_jax.plotting.plan_figures import draw_result, draw_strip, save_figure
+    from wholearm_jax.phases import trajectory
+    from wholearm_jax.plotting import draw_result, draw_strip, save_figure
 
     figures = {"plan": draw_strip, "result": draw_result} if trajectory(result) else {}  # no motion, nothing to draw
     for name, draw in figures.items():

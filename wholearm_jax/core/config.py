@@ -11,7 +11,10 @@ FLAGS_FOR_COMPILE_TIME = (
     "--xla_backend_optimization_level=1",
     "--xla_disable_hlo_passes=while-loop-invariant-code-motion",
 )
-MEASURED_JAX_VERSION = (0, 10)  # XLA refuses flags that it does not know: these are for the version of JAX that was measured
+MEASURED_JAX_VERSION = (
+    0,
+    10,
+)  # XLA refuses flags that it does not know: these are for the version of JAX that was measured
 
 
 def configure(*, compiled: Literal["quickly", "well"] = "quickly") -> None:
@@ -21,7 +24,7 @@ def configure(*, compiled: Literal["quickly", "well"] = "quickly") -> None:
     which costs more to start than it computes. A margin takes 0.75 of the time then, its gradient 0.2 to 0.3. Compiled
     `"quickly"`, as suits single scenes, kernels come from XLA's older emitters and are optimised little, and programs
     do not carry the lines of Python that a profiler would show: half of the compile time. Compiled `"well"`, as suits
-    `check_batch`, very many scenes run faster by an eighth. Programs run in the thread that calls them: handing each to
+    `check`, very many scenes run faster by an eighth. Programs run in the thread that calls them: handing each to
     another costs more than it overlaps (a motion takes 0.66 of the time). What the environment says already stays as
     it is: `XLA_FLAGS`, `JAX_TRACEBACK_IN_LOCATIONS_LIMIT`, `JAX_CPU_ENABLE_ASYNC_DISPATCH`.
 

@@ -225,7 +225,7 @@ def _setting_key(setting) -> str | None:
         code, package = setting.__code__, setting.__module__.partition(".")[0]
         held = [cell.cell_contents for cell in setting.__closure__ or ()]
         held = [_setting_key(value) for value in (*held, *(setting.__defaults__ or ()))]
-        unknown = None in held or package not in (__package__.partition(".")[0], *KEYED_PACKAGES)
+        unknown = None in held or package not in (__name__.partition(".")[0], *KEYED_PACKAGES)
         return None if unknown else f"{setting.__module__}.{setting.__qualname__}:{code.co_firstlineno}{held}"
     return None
 

@@ -23,14 +23,17 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.arrays import as_device_array, eps_power
-from wholearm_jax.core.lookup import take_row
-from wholearm_jax.core.small_linalg import null_vector, inverse_and_determinant, fused_matmul
-from wholearm_jax.core.status import Status
-from wholearm_jax.model.contact_kinematics import constraint_jacobian, tangential_jacobian
-from wholearm_jax.model.mechanics import ScaledMechanics, configuration_unit
-from wholearm_jax.tracing.path import Resolution, ContactPath, chebyshev_points
-from wholearm_jax.tracing.path_root import path_derivatives
+from wholearm_jax.core import (
+    Status,
+    as_device_array,
+    eps_power,
+    fused_matmul,
+    inverse_and_determinant,
+    null_vector,
+    take_row,
+)
+from wholearm_jax.model import ScaledMechanics, configuration_unit, constraint_jacobian, tangential_jacobian
+from wholearm_jax.tracing import ContactPath, Resolution, chebyshev_points, path_derivatives
 
 TERMS = 5  # 1, v^2, v, tau1, tau2
 
@@ -39,31 +42,31 @@ class PathDynamics(eqx.Module):
     """A reduced wire: polynomials in the panel coordinate `xi` in [-1, 1], lowest power first, SI units.
 
     `path_acceleration[p, k]` are the coefficients of `a = ds^2/dt^2` in `(1, v^2, v, tau1, tau2)`, `contact_force[p, k, i]` those of
-    the force in constraint `i` [N]: `c_n`, or `c_t` where `tangential` (a contact that rolls), with `grip` its friction
+    the force in constraint `i` [N]: `c_n`, or `c_t` where `tangential` (a contact that rolls), with `rolling_friction` its friction
     coefficient (0 elsewhere). `configuration[p, k]` are those of `z`, `velocity[p, k]` those of `dz/ds`.
-    `backward[p, k]` are those of `a` in `(1, tau1, tau2)` for travel the other way at rest, times the square of the 5x5
+    `reverse_acceleration[p, k]` are those of `a` in `(1, tau1, tau2)` for travel the other way at rest, times the square of the 5x5
     determinant (against that without friction): the same sign, and smooth where friction would wedge the object on its
-    way back. `tension[piece, i]` is `c_t / c_n` (eq. 3) where a contact slides.
-    `entry` serves an object that arrives with `z_dot` from another formation: its rows times `z_dot` are `ds/dt` after
+    way back. `friction_ratio[piece, i]` is `c_t / c_n` (eq. 3) where a contact slides.
+    `impact_map` serves an object that arrives with `z_dot` from another formation: its rows times `z_dot` are `ds/dt` after
     the inelastic impact and the contacts' impulses [N s] (see `resolve_impact`).
     `error` is the largest interpolation error, relative to each function's own size; `condition` the largest
     condition number of the 5x5 matrix.
     """
 
-    breaks: Float[Array, "pieces_1"]
+    breakpoints: Float[Array, "segments_1"]
     count: Int[Array, ""]
-    factor: Float[Array, "pieces"]
-    first: Int[Array, "pieces"]
-    panels: Int[Array, "pieces"]
+    speed_ratio: Float[Array, "segments"]
+    first: Int[Array, "segments"]
+    panels: Int[Array, "segments"]
     acceleration: Float[Array, "panels powers 5"]
-    backward: Float[Array, "panels powers 3"]
-    force: Float[Array, "panels powers slots 5"]
+    reverse_acceleration: Float[Array, "panels powers 3"]
+    force: Float[Array, "panels powers rows 5"]
     configuration: Float[Array, "panels powers 5"]
     velocity: Float[Array, "panels powers 5"]
-    tension: Float[Array, "pieces slots"]
-    tangential: Bool[Array, "slots"]
-    grip: Float[Array, "slots"]
-    entry: Float[Array, "5 5"]
+    friction_ratio: Float[Array, "segments rows"]
+    tangential: Bool[Array, "rows"]
+    rolling_friction: Float[Array, "rows"]
+    impact_map: Float[Array, "5 5"]
     torque_limit: Float[Array, "2"]
     error: Float[Array, ""]
     condition: Float[Array, ""]
@@ -72,61 +75,61 @@ class PathDynamics(eqx.Module):
     @property
     def length(self) -> Float[Array, ""]:
         """The wire's extent in `s`."""
-        return self.breaks[..., -1] - self.breaks[..., 0]
+        return self.breakpoints[..., -1] - self.breakpoints[..., 0]
 
 
-def equations_of_motion(system: ScaledMechanics, z, x, bend, slip_sign, joint_sign):
+def equations_of_motion(mechanics: ScaledMechanics, z, x, curvature, slip_sign, joint_sign):
     """The 5x5 matrix and its right-hand sides for `(1, v^2, v, tau1, tau2)` at one place of the wire (object units).
 
     `x = dz/ds`, `bend = x'`; `slip_sign` is Xi, `joint_sign` the signs of the joint speeds.
     """
-    friction = (system.contacts.friction * slip_sign)[:, None] * tangential_jacobian(system.contacts, z)
-    wrench = (constraint_jacobian(system.contacts, z) - friction).T
-    matrix = jnp.concatenate([(system.inertia * x)[:, None], -wrench], axis=1)
-    none, weight = jnp.zeros(3, z.dtype), system.inertia[0] * system.gravity
-    dry = jnp.concatenate([weight, jnp.zeros(1, z.dtype), -system.dry * joint_sign])
-    viscous = jnp.concatenate([none, -system.viscous * x[3:]])
+    friction = (mechanics.contacts.friction * slip_sign)[:, None] * tangential_jacobian(mechanics.contacts, z)
+    wrench = (constraint_jacobian(mechanics.contacts, z) - friction).T
+    matrix = jnp.concatenate([(mechanics.inertia * x)[:, None], -wrench], axis=1)
+    none, weight = jnp.zeros(3, z.dtype), mechanics.inertia[0] * mechanics.gravity
+    dry = jnp.concatenate([weight, jnp.zeros(1, z.dtype), -mechanics.dry * joint_sign])
+    viscous = jnp.concatenate([none, -mechanics.viscous * x[3:]])
     torque = jnp.eye(5, dtype=z.dtype)[3:]
-    return matrix, jnp.stack([dry, -system.inertia * bend, viscous, *torque], axis=1)
+    return matrix, jnp.stack([dry, -mechanics.inertia * curvature, viscous, *torque], axis=1)
 
 
-def tabulate_path_dynamics(system: ScaledMechanics, wire: ContactPath) -> PathDynamics:
+def tabulate_path_dynamics(mechanics: ScaledMechanics, path: ContactPath) -> PathDynamics:
     """Solve the 5x5 system at every node of a wire, and at its start for those who enter with speed; tabulate."""
-    shape = wire.nodes.shape[:2]
-    place = jnp.concatenate([wire.nodes.reshape(-1, 5), wire.start[None]])
-    owner = jnp.append(jnp.repeat(wire.owner, shape[1]), 0)
-    chart, xi, turn = wire.chart[owner], wire.slip_sign[owner], wire.joint_sign[owner]
+    shape = path.nodes.shape[:2]
+    place = jnp.concatenate([path.nodes.reshape(-1, 5), path.start[None]])
+    segment_of_panel = jnp.append(jnp.repeat(path.segment_of_panel, shape[1]), 0)
+    chart, xi, turn = path.chart[segment_of_panel], path.slip_sign[segment_of_panel], path.joint_sign[segment_of_panel]
 
     def node(z, u, slip_sign, joint_sign):
-        along = path_derivatives(system, z, u)
-        x, bend = along.x, along.bend
-        matrix, right = equations_of_motion(system, z, x, bend, slip_sign, joint_sign)
-        back, resting = equations_of_motion(system, z, x, bend, -slip_sign, -joint_sign)
+        along = path_derivatives(mechanics, z, u)
+        x, curvature = along.x, along.curvature
+        matrix, right = equations_of_motion(mechanics, z, x, curvature, slip_sign, joint_sign)
+        back, resting = equations_of_motion(mechanics, z, x, curvature, -slip_sign, -joint_sign)
         ahead, with_friction = inverse_and_determinant(matrix)
         # Friction may turn the determinant's sign only by passing through a singular matrix. Without friction,
         # det [M x, -G^T] = x.M x det [G; u]: of M x only the part along x is not in the span of G^T.
-        without = stop_gradient(system.inertia @ x**2 * along.determinant)
+        without = stop_gradient(mechanics.inertia @ x**2 * along.determinant)
         upright = stop_gradient(with_friction) * without
         solution = fused_matmul(ahead, right)
         # Orthogonal to the contacts' wrenches nothing but M x a is left.
         across = null_vector(back[:, 1:].T)
         behind = fused_matmul(resting[:, jnp.array([0, 3, 4])].T, across) * (across @ back[:, 0]) / without**2
         condition = jnp.abs(matrix).sum(0).max() * jnp.abs(ahead).sum(0).max()
-        entry = ahead * system.inertia
+        entry = ahead * mechanics.inertia
         return entry, (x, solution[0], solution[1:], behind, condition, upright)
 
     entry, found = jax.vmap(node)(place, chart, xi, turn)
     x, ahead, force, behind, condition, upright = (a[:-1].reshape(*shape, *a.shape[1:]) for a in found)
 
-    torque, newtons = system.torque_unit, system.force_unit
+    torque, newtons = mechanics.torque_unit, mechanics.force_unit
     per_term = jnp.stack([jnp.ones_like(torque), jnp.ones_like(torque), jnp.ones_like(torque), 1 / torque, 1 / torque])
-    unit = configuration_unit(system.length)
+    unit = configuration_unit(mechanics.length)
     # Apart from what friction and mass change, so that scenes that differ in these alone share their wires.
-    places, by_places = _fit_panels({"configuration": wire.nodes * unit, "velocity": x * unit})
+    places, by_places = _fit_panels({"configuration": path.nodes * unit, "velocity": x * unit})
     dynamics, by_dynamics = _fit_panels(
         {
             "acceleration": ahead * per_term,
-            "backward": behind * per_term[jnp.array([0, 3, 4])],
+            "reverse_acceleration": behind * per_term[jnp.array([0, 3, 4])],
             "force": force * per_term * newtons,
         }
     )
@@ -134,34 +137,34 @@ def tabulate_path_dynamics(system: ScaledMechanics, wire: ContactPath) -> PathDy
     eps = jnp.finfo(x.dtype).eps
     broken = (worst > 0.01 / eps) | ~(upright.min() > 0)
     return PathDynamics(
-        breaks=wire.breaks,
-        count=wire.count,
-        factor=wire.factor,
-        first=wire.first,
-        panels=wire.panels,
+        breakpoints=path.breakpoints,
+        count=path.count,
+        speed_ratio=path.speed_ratio,
+        first=path.first,
+        panels=path.panels,
         **places,
         **dynamics,
-        tension=-system.contacts.friction * wire.slip_sign,
-        tangential=system.contacts.tangential,
-        grip=jnp.where(system.contacts.tangential, system.contacts.friction, 0.0),
-        entry=entry[-1] * jnp.append(1.0, jnp.full(4, newtons))[:, None] / unit,
-        torque_limit=system.torque_limit,
+        friction_ratio=-mechanics.contacts.friction * path.slip_sign,
+        tangential=mechanics.contacts.tangential,
+        rolling_friction=jnp.where(mechanics.contacts.tangential, mechanics.contacts.friction, 0.0),
+        impact_map=entry[-1] * jnp.append(1.0, jnp.full(4, newtons))[:, None] / unit,
+        torque_limit=mechanics.torque_limit,
         error=jnp.maximum(by_places, by_dynamics),
         condition=worst,
-        status=jnp.where(wire.status > 0, wire.status, jnp.where(broken, int(Status.SINGULAR), 0)),
+        status=jnp.where(path.status > 0, path.status, jnp.where(broken, int(Status.SINGULAR), 0)),
     )
 
 
 def placeholder_dynamics(resolution: Resolution, contacts: int = 4) -> PathDynamics:
     """A table of the right shapes that holds no wire: something to compile with."""
-    pieces, panels, nodes, _ = resolution
+    segments, panels, nodes, _ = resolution
     zero, whole, one = as_device_array(0.0), as_device_array(0), as_device_array(1)
-    each = {name: np.zeros((panels, nodes, n)) for name, n in (("acceleration", 5), ("backward", 3))}
+    each = {name: np.zeros((panels, nodes, n)) for name, n in (("acceleration", 5), ("reverse_acceleration", 3))}
     each |= {name: np.zeros((panels, nodes, 5)) for name in ("configuration", "velocity")}
-    each |= {"force": np.zeros((panels, nodes, contacts, TERMS)), "tension": np.zeros((pieces, contacts))}
-    each |= {"breaks": np.arange(pieces + 1.0), "factor": np.ones(pieces), "torque_limit": np.ones(2)}
-    each |= {"tangential": np.zeros(contacts, bool), "grip": np.zeros(contacts)}
-    each |= {"entry": np.zeros((5, 5)), "first": np.zeros(pieces, int), "panels": np.ones(pieces, int)}
+    each |= {"force": np.zeros((panels, nodes, contacts, TERMS)), "friction_ratio": np.zeros((segments, contacts))}
+    each |= {"breakpoints": np.arange(segments + 1.0), "speed_ratio": np.ones(segments), "torque_limit": np.ones(2)}
+    each |= {"tangential": np.zeros(contacts, bool), "rolling_friction": np.zeros(contacts)}
+    each |= {"impact_map": np.zeros((5, 5)), "first": np.zeros(segments, int), "panels": np.ones(segments, int)}
     filled = {name: as_device_array(value) for name, value in each.items()}
     return PathDynamics(count=one, error=zero, condition=zero, status=whole, **filled)
 
@@ -173,11 +176,11 @@ class Impact(NamedTuple):
     """
 
     speed: Float[Array, ""]
-    impulse: Float[Array, "slots"]
+    impulse: Float[Array, "rows"]
     size: Float[Array, ""]
 
 
-def resolve_impact(table: PathDynamics, z_dot: Float[Array, "5"]) -> Impact:
+def resolve_impact(dynamics: PathDynamics, z_dot: Float[Array, "5"]) -> Impact:
     """The inelastic impact by which a formation takes over from another that moves with `z_dot` (SI).
 
     Velocities after it are the new wire's, `x v`; impulses `p` obey the friction of forward travel:
@@ -187,21 +190,27 @@ def resolve_impact(table: PathDynamics, z_dot: Float[Array, "5"]) -> Impact:
     the 5x5 system of the equations of motion with momenta in place of forces. Kinetic energy never grows: with
     `z_dot_plus = x v` and compressive `p`, what is lost is that of `z_dot_plus - z_dot_minus` and the work of friction.
     """
-    after = table.entry @ z_dot
-    return Impact(after[0], after[1:], (jnp.abs(table.entry) @ jnp.abs(z_dot))[1:].max())
+    after = dynamics.impact_map @ z_dot
+    return Impact(after[0], after[1:], (jnp.abs(dynamics.impact_map) @ jnp.abs(z_dot))[1:].max())
 
 
-def locate_panel(table: PathDynamics, piece: Int[Array, ""], s: Float[Array, ""]) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The panel of `piece` that serves `s` (the nearest one beyond the piece's ends) and the panel coordinate.
+def locate_panel(
+    dynamics: PathDynamics, segment: Int[Array, ""], s: Float[Array, ""]
+) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """The panel of `segment` that serves `s` (the nearest one beyond the piece's ends) and the panel coordinate.
 
     More than a panel beyond the piece its functions stay what they are there: only steps that will be taken again, and
     intervals of an optimisation under way, come so far.
     """
-    low, high, panels = take_row(table.breaks, piece), take_row(table.breaks, piece + 1), take_row(table.panels, piece)
+    low, high, panels = (
+        take_row(dynamics.breakpoints, segment),
+        take_row(dynamics.breakpoints, segment + 1),
+        take_row(dynamics.panels, segment),
+    )
     width = jnp.where(high > low, high - low, 1.0)
     share = (s - low) / width * panels
     local = jnp.clip(jnp.floor(jax.lax.stop_gradient(share)), 0, jnp.maximum(panels - 1, 0))
-    return take_row(table.first, piece) + local.astype(int), jnp.clip(2 * (share - local) - 1, -3.0, 3.0)
+    return take_row(dynamics.first, segment) + local.astype(int), jnp.clip(2 * (share - local) - 1, -3.0, 3.0)
 
 
 def evaluate_polynomial(coefficients: Float[Array, "powers ..."], xi: Float[Array, ""]) -> Float[Array, "..."]:
@@ -226,8 +235,8 @@ def evaluate(coefficients: Float[Array, "panels powers ..."], panel: Int[Array, 
 
 
 def evaluate_dot(
-    coefficients: Float[Array, "panels powers *slots terms"], panel: Int[Array, ""], xi, terms: Float[Array, "terms"]
-) -> Float[Array, "*slots"]:
+    coefficients: Float[Array, "panels powers *rows terms"], panel: Int[Array, ""], xi, terms: Float[Array, "terms"]
+) -> Float[Array, "*rows"]:
     """The sum of one of a table's functions times `terms`, at the place that `locate_panel` tells."""
     return _evaluate_dot(take_row(coefficients, panel), xi, terms)
 
@@ -267,7 +276,9 @@ def _fit_panels(columns: dict[str, Float[Array, "panels nodes *shape"]]) -> tupl
         for matrix, values in ((to_powers, every), (to_last, stop_gradient(every)))
     )
     fitted = {name: each.reshape(c.shape) for (name, c), each in zip(columns.items(), powers, strict=True)}
-    errors = [_interpolation_error(c.reshape(*c.shape[:2], -1), last) for c, last in zip(columns.values(), lasts, strict=True)]
+    errors = [
+        _interpolation_error(c.reshape(*c.shape[:2], -1), last) for c, last in zip(columns.values(), lasts, strict=True)
+    ]
     return fitted, jnp.stack(errors).max()
 
 

@@ -22,30 +22,27 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.programs import Program, call_in_background, wait_for
-from wholearm_jax.core.status import Status
-from wholearm_jax.core.validation import require_positive, require_x64
-from wholearm_jax.dynamics.path_dynamics import PathDynamics, tabulate_path_dynamics
+from wholearm_jax.core import Program, Status, call_in_background, require_positive, require_x64, wait_for
+from wholearm_jax.dynamics import PathDynamics, tabulate_path_dynamics
 from wholearm_jax.ensembles.ensemble import Ensemble, stack
-from wholearm_jax.model.mechanics import scaled_mechanics
-from wholearm_jax.model.scene import ContactFormation, Scene, rigid_body
-from wholearm_jax.model.schedule import TorqueSchedule, pad_schedule
-from wholearm_jax.phases.phase import SimulatedPhase, final_configuration
-from wholearm_jax.phases.plan import (
+from wholearm_jax.model import ContactFormation, Scene, TorqueSchedule, pad_schedule, rigid_body, scaled_mechanics
+from wholearm_jax.phases import (
+    Result,
+    SimulatedPhase,
+    certify_rest,
+    final_configuration,
+    has_torque_jumps,
+    initial_carry,
+    phase_inputs,
     require_covered,
     require_motion,
-    simulate,
-    initial_carry,
     scan_step,
-    phase_inputs,
+    simulate,
     stack_trees,
-    has_torque_jumps,
     trace_paths_in_one_program,
 )
-from wholearm_jax.phases.rest_certificate import certify_rest
-from wholearm_jax.phases.result import Result
-from wholearm_jax.simulation.integrator import IntegratorOptions
-from wholearm_jax.tracing.path import Resolution, ContactPath, placeholder_path
+from wholearm_jax.simulation import IntegratorOptions
+from wholearm_jax.tracing import ContactPath, Resolution, placeholder_path
 
 BLOCK = 128  # scenes that one device takes at once
 CHUNK = 4096  # scenes whose results are kept together
@@ -75,11 +72,11 @@ class Fidelity(NamedTuple):
     """How finely to compute, and the table error up to which the result counts."""
 
     resolution: Resolution
-    how: IntegratorOptions
+    options: IntegratorOptions
     error: float
 
 
-COARSE_PASS = Fidelity(Resolution(4, 7, 8, 64), IntegratorOptions(tolerance=1e-8, max_steps=96, stages=4), 5e-7)
+COARSE_PASS = Fidelity(Resolution(4, 7, 8, 64), IntegratorOptions(tolerance=1e-8, max_steps=96, max_stages=4), 5e-7)
 FINE_PASS = Fidelity(Resolution(), IntegratorOptions(), 1e-9)
 
 
@@ -125,7 +122,7 @@ class SceneBatch(eqx.Module):
         """Scene number `number`."""
         return jax.tree.map(lambda leaf: leaf[number], self.scenes)
 
-    def part(self, numbers: np.ndarray) -> "Given":
+    def part(self, numbers: np.ndarray) -> "SceneBatch":
         """Some of the scenes, numbered anew."""
         return SceneBatch(jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), self.scenes))
 
@@ -144,7 +141,7 @@ class _Stop(NamedTuple):
     held: Bool[Array, ""]
 
 
-def check_batch(
+def check(
     scenes: Ensemble | Scene | Sequence[Scene],
     torque: TorqueSchedule,
     *,
@@ -159,14 +156,16 @@ def check_batch(
     `scenes` may differ in every number, in formations and in the number of vertices (see `variation.stack`).
     Margins are right to 1e-6 N; a `tolerance` [N] below 1e-9 has all computed as by `simulate`. A phase arrives when
     it ends within a share `arrival` of its wire's length of the end (1e-6 for a plan that does not vary, by
-    `simulate`), at a speed that fits (`verdict.ARRIVAL_SPEED_FACTOR`). Memory is that of `chunk` scenes beside the result. Returns
+    `simulate`), at a speed that fits (`assessment.ARRIVAL_SPEED_FACTOR`). Memory is that of `chunk` scenes beside the result. Returns
     `BatchResult`: status, margin, time, contact, phase and end pose of each scene. Never raises for a scene that fails:
     that is a status. Raises ValueError for one scene that is not stacked, for a schedule shorter than a plan, for
     numbers that are not positive, and for a `count` of more scenes than are given.
     """
     if isinstance(scenes, Scene) and np.ndim(scenes.object.mass) == 0:
         raise ValueError("this is one scene: check [scene], or vary it (wholearm_jax.ensembles.ensemble.vary)")
-    source = scenes if isinstance(scenes, Ensemble) else SceneBatch(scenes if isinstance(scenes, Scene) else stack(scenes))
+    source = (
+        scenes if isinstance(scenes, Ensemble) else SceneBatch(scenes if isinstance(scenes, Scene) else stack(scenes))
+    )
     if count is None:
         if isinstance(source, Ensemble):
             raise ValueError("an ensemble has no end: say how many of its scenes to check, with count")
@@ -188,7 +187,7 @@ def check_in_chunks(
     devices: Sequence[Any] | None = None,
     wanted: Sequence[int] | None = None,
 ) -> Iterator[tuple[int, BatchResult]]:
-    """`check_batch` one chunk after the other: numbers of chunks (those `wanted`, by default all) with their results."""
+    """`check` one chunk after the other: numbers of chunks (those `wanted`, by default all) with their results."""
     require_x64()
     require_positive(count=count, tolerance=tolerance, arrival=arrival, chunk=chunk)
     require_motion(source.nominal)  # holds need linear programmes, which compiled checks leave out
@@ -205,7 +204,7 @@ def _check_rows(source, rows, torque: TorqueSchedule, arrival, levels, mesh) -> 
     schedule, steps = pad_schedule(torque), has_torque_jumps(source.nominal, torque)
     found, left, alone = None, np.arange(len(rows)), []
     for level in levels:
-        level = level._replace(how=replace(level.how, steps=steps))
+        level = level._replace(options=replace(level.options, has_jumps=steps))
         answer, grade = _check_packed(source, rows[left], schedule, arrival, level, mesh)
         if found is None:
             found = answer
@@ -242,19 +241,19 @@ def _check_block(source: SceneSource, numbers, schedule: TorqueSchedule, arrival
     side_by_side = mesh.devices.flat[0].platform != "cpu"
     told = source, schedule, arrival, level, side_by_side
     compiled = call_in_background(_check_blank, mesh, told, numbers)
-    wires = _on(mesh, _wires_of, (source, level.resolution, side_by_side), numbers)
+    paths = _on(mesh, _wires_of, (source, level.resolution, side_by_side), numbers)
     wait_for(compiled)
-    return _on(mesh, _checks_of, told, numbers, wires)
+    return _on(mesh, _checks_of, told, numbers, paths)
 
 
 def _check_blank(mesh: Mesh, told: tuple, numbers) -> None:
     """Check scenes on wires that were not found: that compiles the program for those that were."""
     source, _, _, level, _ = told
     shape = mesh.size if source.same_wires else len(numbers), len(source.nominal.phases)
-    wires = jax.tree.map(lambda a: np.broadcast_to(a, (*shape, *a.shape)), placeholder_path(level.resolution))
+    paths = jax.tree.map(lambda a: np.broadcast_to(a, (*shape, *a.shape)), placeholder_path(level.resolution))
     if mesh.size > 1:  # where those that are traced will be
-        wires = jax.device_put(wires, NamedSharding(mesh, PartitionSpec("scenes")))
-    _on(mesh, _checks_of, told, numbers, wires)
+        paths = jax.device_put(paths, NamedSharding(mesh, PartitionSpec("scenes")))
+    _on(mesh, _checks_of, told, numbers, paths)
 
 
 def _on(mesh: Mesh, program: Program, told: tuple, *each):
@@ -286,17 +285,17 @@ def _wires_of(told, numbers):
 
 
 @Program
-def _checks_of(told, numbers, wires):
+def _checks_of(told, numbers, paths):
     """Check scenes on their wires."""
     source, schedule, arrival, level, side_by_side = told
 
-    def on_wires(number, wires):
-        return check_wires(source.draw(number), wires, schedule, arrival, level)
+    def on_wires(number, paths):
+        return check_wires(source.draw(number), paths, schedule, arrival, level)
 
     if source.same_wires:
-        shared = jax.tree.map(lambda a: a[0], wires)
+        shared = jax.tree.map(lambda a: a[0], paths)
         return _each(lambda number: on_wires(number, shared), side_by_side)(numbers)
-    return _each(lambda one: on_wires(*one), side_by_side)((numbers, wires))
+    return _each(lambda one: on_wires(*one), side_by_side)((numbers, paths))
 
 
 def _each(function, side_by_side: bool):
@@ -310,20 +309,22 @@ def check_scene(scene: Scene, schedule: TorqueSchedule, arrival, level: Fidelity
     return check_wires(scene, trace_paths_in_one_program(scene, level.resolution), schedule, arrival, level)
 
 
-def check_wires(scene: Scene, wires: ContactPath, schedule: TorqueSchedule, arrival, level: Fidelity) -> tuple[BatchResult, Int[Array, ""]]:
+def check_wires(
+    scene: Scene, paths: ContactPath, schedule: TorqueSchedule, arrival, level: Fidelity
+) -> tuple[BatchResult, Int[Array, ""]]:
     """Check one scene on its wires."""
     solid = rigid_body(scene.object)
 
     def one(clock, phase):
-        wire, motion, formation = phase
+        path, motion, formation = phase
         mechanics = scaled_mechanics(solid, scene.hand, scene.gravity, formation)
-        table = tabulate_path_dynamics(mechanics, wire)
-        clock, done = scan_step(schedule, level.how, arrival, clock, (table, *motion))
-        held = certify_rest(mechanics, table, schedule, done)
-        return clock, _stop(table, done, formation, level, held)
+        dynamics = tabulate_path_dynamics(mechanics, path)
+        clock, done = scan_step(schedule, level.options, arrival, clock, (dynamics, *motion))
+        held = certify_rest(mechanics, dynamics, schedule, done)
+        return clock, _stop(dynamics, done, formation, level, held)
 
     told = stack_trees([(phase_inputs(p), p.formation) for p in scene.phases])
-    _, stops = jax.lax.scan(one, initial_carry(schedule), (wires, *told))
+    _, stops = jax.lax.scan(one, initial_carry(schedule), (paths, *told))
     failed = stops.status != int(Status.OK)
     where = jnp.where(failed.any(), jnp.argmax(failed), jnp.argmin(stops.margin))
     last = jnp.where(failed.any(), where, len(scene.phases) - 1)
@@ -344,25 +345,25 @@ def check_wires(scene: Scene, wires: ContactPath, schedule: TorqueSchedule, arri
     return answer, jnp.select([jnp.any(~stops.good & needed), doubtful], [FINER, ALONE], GOOD)
 
 
-def _stop(table: PathDynamics, done: SimulatedPhase, formation: ContactFormation, level: Fidelity, held) -> _Stop:
+def _stop(dynamics: PathDynamics, done: SimulatedPhase, formation: ContactFormation, level: Fidelity, held) -> _Stop:
     """One phase's result, and whether it is to be trusted: a fine table, and neither steps nor pieces used up; rests
     that are `held` for sure."""
     motion = done.motion
-    known = jnp.isfinite(done.score.margin) & (table.status == 0)
+    known = jnp.isfinite(done.margin_result.margin) & (dynamics.status == 0)
     of_slot = jnp.cumsum(~formation.tangential) - 1
-    status, contact = done.verdict.status, done.verdict.contact
+    status, contact = done.assessment.status, done.assessment.contact
     worth = (status != int(Status.MAX_STEPS)) & (status != int(Status.NO_CONVERGENCE))
-    fine = (table.error <= level.error) & (table.count < level.resolution.pieces)
+    fine = (dynamics.error <= level.error) & (dynamics.count < level.resolution.segments)
     return _Stop(
         status=status,
-        margin=jnp.where(known, done.score.margin, -jnp.inf),
-        margin_time=done.start + done.duration * done.score.share,
-        margin_contact=of_slot[done.score.contact],
-        time=done.start + done.duration * done.verdict.share,
+        margin=jnp.where(known, done.margin_result.margin, -jnp.inf),
+        margin_time=done.start + done.duration * done.margin_result.phase_time,
+        margin_contact=of_slot[done.margin_result.contact],
+        time=done.start + done.duration * done.assessment.phase_time,
         contact=jnp.where(contact >= 0, of_slot[contact], -1),
-        end=jnp.where(table.status == 0, final_configuration(table, motion), jnp.nan),
-        good=jnp.where(table.status == 0, fine & worth, worth),
-        held=held | (table.status != 0),
+        end=jnp.where(dynamics.status == 0, final_configuration(dynamics, motion), jnp.nan),
+        good=jnp.where(dynamics.status == 0, fine & worth, worth),
+        held=held | (dynamics.status != 0),
     )
 
 
@@ -379,8 +380,8 @@ def from_result(result: Result) -> BatchResult:
     last = rows[-1 if failed is None else failed]
     p = rows[where]
     named = p.margin_contact if failed is None else p.contact
-    table, motion = last.traced.table, last.outcome.motion
-    end = final_configuration(table, motion) if int(table.status) == Status.OK else jnp.full(5, jnp.nan)
+    dynamics, motion = last.traced.dynamics, last.outcome.motion
+    end = final_configuration(dynamics, motion) if int(dynamics.status) == Status.OK else jnp.full(5, jnp.nan)
     return BatchResult(
         status=np.asarray(int(result.status)),
         margin=np.asarray(result.margin),

@@ -16,9 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.model.polygon import remains_simple
-from wholearm_jax.model.scene import COORDINATES, LINKS, Scene
-from wholearm_jax.phases.plan import stack_trees
+from wholearm_jax.model import COORDINATES, LINKS, Scene, remains_simple
+from wholearm_jax.phases import stack_trees
 
 FINGERS = ("finger 1", "finger 2")
 
@@ -152,7 +151,7 @@ def _renamed(scene: Scene, like: Scene) -> Scene:
     if len(scene.phases) != len(like.phases):
         return scene
     pairs = zip(scene.phases, like.phases, strict=True)
-    phases = tuple(type(p)(q.name, p.formation, p.heading, p.duration, p.arrive) for p, q in pairs)
+    phases = tuple(type(p)(q.name, p.formation, p.target, p.duration, p.arrive) for p, q in pairs)
     return Scene(like.title, scene.gravity, scene.hand, scene.object, scene.start, phases)
 
 

@@ -7,7 +7,7 @@ quantile; the best schedule met on the way is kept, the nominal one among them.
 
 Driven open loop, samples with other friction cannot all arrive exactly. A sample *holds* when every contact stays in
 compression while each phase lasts and the phase ends within a share `arrival` of its wire's length of the end, at a
-speed that fits (`verdict`); the next phase then starts at rest at the end, as in every plan.
+speed that fits (`assessment`); the next phase then starts at rest at the end, as in every plan.
 
 Derivation: section 11 of `docs/derivation.md`.
 """
@@ -22,24 +22,29 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float
 
-from wholearm_jax.core.programs import Program
-from wholearm_jax.core.status import Status
-from wholearm_jax.core.validation import require_positive
+from wholearm_jax.core import Program, Status, require_positive
 from wholearm_jax.ensembles.ensemble import Ensemble
-from wholearm_jax.margin.contact_forces import log_barrier_minimum
-from wholearm_jax.model.mechanics import scaled_mechanics
-from wholearm_jax.model.scene import Scene, rigid_body
-from wholearm_jax.model.schedule import TorqueSchedule, limit_violations, pad_schedule
-from wholearm_jax.optimisation.optimiser import optimise
-from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR
-from wholearm_jax.phases.phase import SimulatedPhase, TracedPhase
-from wholearm_jax.phases.plan import simulate_phases, require_covered, require_motion, with_plan_step_capacity, simulate, has_torque_jumps, trace
-from wholearm_jax.phases.rest_certificate import certify_rest
-from wholearm_jax.simulation.integrator import IntegratorOptions
-from wholearm_jax.tracing.path import Resolution
+from wholearm_jax.margin import log_barrier_minimum
+from wholearm_jax.model import Scene, TorqueSchedule, limit_violations, pad_schedule, rigid_body, scaled_mechanics
+from wholearm_jax.optimisation import optimise
+from wholearm_jax.phases import (
+    ARRIVAL_SPEED_FACTOR,
+    SimulatedPhase,
+    TracedPhase,
+    certify_rest,
+    has_torque_jumps,
+    require_covered,
+    require_motion,
+    simulate,
+    simulate_phases,
+    trace,
+    with_plan_step_capacity,
+)
+from wholearm_jax.simulation import IntegratorOptions
+from wholearm_jax.tracing import Resolution
 
 COARSE = Resolution(6, 24, 8)
-HOW = IntegratorOptions(tolerance=1e-7, max_steps=128, stages=6, adjoint="reverse")
+HOW = IntegratorOptions(tolerance=1e-7, max_steps=128, max_stages=6, adjoint="reverse")
 WITHIN = 0.5  # share of the tolerance of arrival that the climb leaves as it is
 NONE = -10.0  # margin [N] of a phase without any motion
 TEMPERATURE = 0.02  # of the smooth minimum, as a share of the nominal margin
@@ -49,19 +54,19 @@ TEMPERATURE = 0.02  # of the smooth minimum, as a share of the nominal margin
 class SampleScore:
     """How a schedule does on scenes: the share that holds, and the margin [N] at the quantile asked for."""
 
-    share: float
+    success_rate: float
     margin: float
 
 
 @dataclass(frozen=True)
 class RobustSchedule:
-    """A robust schedule beside the `nominal` one; `seen` and `unseen` are (nominal, robust) on the sampled scenes and
+    """A robust schedule beside the `nominal` one; `in_sample` and `out_of_sample` are (nominal, robust) on the sampled scenes and
     on as many others."""
 
     torque: TorqueSchedule
     nominal: TorqueSchedule
-    seen: tuple[SampleScore, SampleScore]
-    unseen: tuple[SampleScore, SampleScore]
+    in_sample: tuple[SampleScore, SampleScore]
+    out_of_sample: tuple[SampleScore, SampleScore]
 
 
 def optimise_robustly(
@@ -91,11 +96,11 @@ def optimise_robustly(
     start = optimise(scene, knots=knots).torque if nominal is None else nominal
     require_covered(scene, start)
     _require_within(limit, start)
-    seen, unseen = (_sampled(ensemble, jnp.arange(samples) + first) for first in (0, samples))
-    how = replace(with_plan_step_capacity(HOW, scene, start), steps=has_torque_jumps(scene, start))
+    in_sample, out_of_sample = (_sampled(ensemble, jnp.arange(samples) + first) for first in (0, samples))
+    options = replace(with_plan_step_capacity(HOW, scene, start), has_jumps=has_torque_jumps(scene, start))
 
     def tried(torque: TorqueSchedule, sampled: _Sampled) -> tuple[_Climbed, SampleScore]:
-        found = _objective_and_gradient(torque, sampled, jnp.asarray(arrival, float), how)
+        found = _objective_and_gradient(torque, sampled, jnp.asarray(arrival, float), options)
         holds = np.array(found.holds)
         for k in np.flatnonzero(holds & ~np.asarray(found.proved)):
             alone = jax.tree.map(lambda leaf, k=k: leaf[k], sampled.scenes)
@@ -108,11 +113,11 @@ def optimise_robustly(
     best, nominally, best_held = start, None, SampleScore(-1.0, -np.inf)
     for step in range(steps + 1):
         torque = TorqueSchedule(start.times, share * limit)
-        found, now = tried(torque, seen)
+        found, now = tried(torque, in_sample)
         if callback is not None:
             callback(step, now)
         nominally = nominally or now
-        if (now.share, now.margin) > (best_held.share, best_held.margin):
+        if (now.success_rate, now.margin) > (best_held.success_rate, best_held.margin):
             best, best_held = torque, now
         moves, state = adam.update(-found.slope * limit, state)
         share = jnp.clip(jnp.asarray(optax.apply_updates(share, moves)), -1.0, 1.0)
@@ -120,8 +125,8 @@ def optimise_robustly(
     return RobustSchedule(
         best,
         start,
-        seen=(nominally, best_held),
-        unseen=(tried(start, unseen)[1], tried(best, unseen)[1]),
+        in_sample=(nominally, best_held),
+        out_of_sample=(tried(start, out_of_sample)[1], tried(best, out_of_sample)[1]),
     )
 
 
@@ -160,18 +165,20 @@ def _sampled(ensemble: Ensemble, numbers) -> _Sampled:
 
 
 @Program
-def _objective_and_gradient(torque: TorqueSchedule, sampled: _Sampled, arrival, how: IntegratorOptions) -> _Climbed:
+def _objective_and_gradient(torque: TorqueSchedule, sampled: _Sampled, arrival, options: IntegratorOptions) -> _Climbed:
     """How a schedule does on all samples, and which way it gets better."""
 
     def objective(values) -> tuple[Float[Array, ""], tuple]:
         def one(sample: _Sampled):
             scene, at = sample
-            found = simulate_phases(scene, TorqueSchedule(torque.times, values), at, how, arrival)
-            least = jnp.stack([jnp.where(jnp.isfinite(o.score.margin), o.score.margin, NONE) for o in found]).min()
+            found = simulate_phases(scene, TorqueSchedule(torque.times, values), at, options, arrival)
+            least = jnp.stack(
+                [jnp.where(jnp.isfinite(o.margin_result.margin), o.margin_result.margin, NONE) for o in found]
+            ).min()
             ends = zip(scene.phases, found, at, strict=True)
-            missed = jnp.stack([_arrival_penalty(o, t.table, p.arrive, arrival) for p, o, t in ends]).sum()
-            holds = jnp.stack([o.verdict.status == int(Status.OK) for o in found]).all()
-            moves = jnp.stack([jnp.isfinite(o.score.margin) for o in found]).all()
+            missed = jnp.stack([_arrival_penalty(o, t.dynamics, p.arrive, arrival) for p, o, t in ends]).sum()
+            holds = jnp.stack([o.assessment.status == int(Status.OK) for o in found]).all()
+            moves = jnp.stack([jnp.isfinite(o.margin_result.margin) for o in found]).all()
             return least, missed, holds, moves, _rests_proved(sample, torque, found)
 
         margins, missed, holds, moves, proved = jax.vmap(one)(sampled)
@@ -189,14 +196,16 @@ def _rests_proved(sample: _Sampled, torque: TorqueSchedule, found: tuple[Simulat
     scene, traced = sample
     fixed = jax.lax.stop_gradient(found)
     solid, rows = rigid_body(scene.object), zip(scene.phases, traced, fixed, strict=True)
-    each = [(scaled_mechanics(solid, scene.hand, scene.gravity, p.formation), t.table, o) for p, t, o in rows]
-    return jnp.stack([certify_rest(mechanics, table, pad_schedule(torque), o) for mechanics, table, o in each]).all()
+    each = [(scaled_mechanics(solid, scene.hand, scene.gravity, p.formation), t.dynamics, o) for p, t, o in rows]
+    return jnp.stack(
+        [certify_rest(mechanics, dynamics, pad_schedule(torque), o) for mechanics, dynamics, o in each]
+    ).all()
 
 
-def _arrival_penalty(outcome, table, arrive: str, arrival):
+def _arrival_penalty(outcome, dynamics, arrive: str, arrival):
     """How far beyond the tolerance a phase ends from where it should: a logarithm, lest the worst sample rule all."""
     at = outcome.motion.count
-    off = [jnp.abs(table.breaks[-1] - outcome.motion.s[at]) / table.length / arrival]
+    off = [jnp.abs(dynamics.breakpoints[-1] - outcome.motion.s[at]) / dynamics.length / arrival]
     if arrive == "rest":
-        off.append(outcome.motion.w[at] / table.length / jnp.sqrt(ARRIVAL_SPEED_FACTOR * arrival))
+        off.append(outcome.motion.w[at] / dynamics.length / jnp.sqrt(ARRIVAL_SPEED_FACTOR * arrival))
     return sum(jnp.log1p(jnp.maximum(one - WITHIN, 0.0) ** 2) for one in off)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from wholearm_jax.core.status import Status
+from wholearm_jax.core import Status
 from wholearm_jax.ensembles.batch import BatchResult
 from wholearm_jax.ensembles.proportion import wilson_interval
-from wholearm_jax.model.scene import Scene
+from wholearm_jax.model import Scene
 
 SAMPLE = 100_000  # scenes, evenly spread, from which quantiles and influences are taken
 QUANTILES = (0.0, 0.01, 0.05, 0.5, 0.95, 1.0)
@@ -86,10 +86,14 @@ def summarise(scene: Scene, chunks: Iterable[BatchResult], count: int) -> Ensemb
         margins.append(part.margin[kept])
         statuses.append(part.status[kept])
         first += len(part.status)
-    return EnsembleSummary(count, holds, dict(failures), *(np.concatenate(column) for column in (numbers, margins, statuses)))
+    return EnsembleSummary(
+        count, holds, dict(failures), *(np.concatenate(column) for column in (numbers, margins, statuses))
+    )
 
 
-def rank_correlations(margins: Float[np.ndarray, "n"], shifts: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "p"]:
+def rank_correlations(
+    margins: Float[np.ndarray, "n"], shifts: Float[np.ndarray, "n parameters"]
+) -> Float[np.ndarray, "p"]:
     """Spearman's rank correlation of the margin with each parameter, like values sharing the mean of their ranks; 0
     where either does not vary."""
     from scipy.stats import rankdata  # takes half a second to import

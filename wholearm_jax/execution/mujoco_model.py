@@ -32,11 +32,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from wholearm_jax.model.contact_kinematics import contact_candidates
-from wholearm_jax.model.scene import EDGE, LINKS, VERTEX, Scene, rigid_body, contact_name, parse_contact
+from wholearm_jax.model import EDGE, LINKS, VERTEX, Scene, contact_candidates, contact_name, parse_contact, rigid_body
 
 POINT_RADIUS = 1e-5  # radius of a dot [object radii]: far above rounding, its lever arm far below any tolerance
-PAIR_DISTANCE = 1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
+PAIR_DISTANCE = (
+    1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
+)
 HALF_SPACE_DEPTH = 0.2  # slabs, and all shapes in depth [object radii]
 
 

@@ -22,25 +22,30 @@ import numpy as np
 from jaxtyping import Array, Float
 from joblib import Parallel, delayed
 
-from wholearm_jax.core.validation import require_positive
-from wholearm_jax.ensembles.proportion import wilson_interval
-from wholearm_jax.execution.mujoco_model import MujocoModel, ContactCompliance, build_mujoco_model
-from wholearm_jax.execution.rollout import (
+from wholearm_jax.core import require_positive
+from wholearm_jax.ensembles import wilson_interval
+from wholearm_jax.execution.executions import (
     ExecutionOutcome,
     Tolerance,
-    clock,
-    rollout,
     assess_execution,
+    clock,
     motor_torques,
     require_wires,
+    rollout,
     start_of,
     target_of,
 )
-from wholearm_jax.model.contact_kinematics import gaps, normal_jacobian
-from wholearm_jax.model.mechanics import scaled_mechanics
-from wholearm_jax.model.polygon import remains_simple
-from wholearm_jax.model.scene import ContactFormation, Scene, rigid_body
-from wholearm_jax.phases.result import Result
+from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
+from wholearm_jax.model import (
+    ContactFormation,
+    Scene,
+    gaps,
+    normal_jacobian,
+    remains_simple,
+    rigid_body,
+    scaled_mechanics,
+)
+from wholearm_jax.phases import Result
 
 
 class Amounts(NamedTuple):

@@ -17,7 +17,7 @@ import numpy as np
 import zarr
 from zarr.errors import GroupNotFoundError
 
-from wholearm_jax.ensembles.batch import BatchResult
+from wholearm_jax.ensembles import BatchResult
 
 KIND = "wholearm_jax check"
 # Status, contact and phase numbers are small; -1 marks "none".

@@ -12,10 +12,9 @@ from zlib import error as ZlibError
 import jax
 import numpy as np
 
-from wholearm_jax.ensembles.batch import SceneBatch
+from wholearm_jax.ensembles import SceneBatch
 from wholearm_jax.files.scene_toml import SceneError
-from wholearm_jax.model.polygon import find_defect
-from wholearm_jax.model.scene import Polygon, Scene
+from wholearm_jax.model import Polygon, Scene, find_defect
 
 _UNREADABLE = (OSError, ValueError, KeyError, AttributeError, TypeError, EOFError, BadZipFile, ZlibError)
 

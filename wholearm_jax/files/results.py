@@ -12,16 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wholearm_jax.core.atomic_files import write_atomically
+from wholearm_jax.core import write_atomically
 from wholearm_jax.files.scene_toml import CONSTRAINTS, SceneError, to_dict
-from wholearm_jax.model.scene import COORDINATES
-from wholearm_jax.model.schedule import TorqueSchedule, torque_schedule
-from wholearm_jax.phases.result import Result
-from wholearm_jax.phases.sampling import trajectory
+from wholearm_jax.model import COORDINATES, TorqueSchedule, torque_schedule
+from wholearm_jax.phases import Result, trajectory
 
 if TYPE_CHECKING:  # running them needs MuJoCo, writing does not
-    from wholearm_jax.execution.rollout import Execution
-    from wholearm_jax.execution.trials import TrialsResult
+    from wholearm_jax.execution import Execution, TrialsResult
 
 TORQUE_COLUMNS = ("t", "tau1", "tau2")
 _CONTACTS = range(1, CONSTRAINTS + 1)
@@ -37,7 +34,7 @@ def read_torque(path: str | Path) -> TorqueSchedule:
 
     Raises `SceneError` naming the file, the line and the cause.
 
-    >>> wa.write_torque(wa.torque([0.0, 2.0], [[0.5, -0.2], [0.5, -0.4]]), folder / "torque.csv")
+    >>> wa.write_torque(wa.torque_schedule([0.0, 2.0], [[0.5, -0.2], [0.5, -0.4]]), folder / "torque.csv")
     >>> wa.read_torque(folder / "torque.csv").values.tolist()
     [[0.5, -0.2], [0.5, -0.4]]
     """
@@ -81,7 +78,7 @@ def read_torque(path: str | Path) -> TorqueSchedule:
 def write_torque(schedule: TorqueSchedule, path: str | Path) -> None:
     """Write a torque schedule (header `t,tau1,tau2`; s, N m) with every digit. Raises `OSError`.
 
-    >>> wa.write_torque(wa.torque([0.0, 2.0], [[0.5, -0.2], [0.5, -0.4]]), folder / "torque.csv")
+    >>> wa.write_torque(wa.torque_schedule([0.0, 2.0], [[0.5, -0.2], [0.5, -0.4]]), folder / "torque.csv")
     >>> print((folder / "torque.csv").read_text(), end="")
     t,tau1,tau2
     0.0,0.5,-0.2

@@ -21,10 +21,19 @@ from pydantic import (
     model_validator,
 )
 
-from wholearm_jax.core.arrays import as_device_array
-from wholearm_jax.core.atomic_files import write_atomically
-from wholearm_jax.model.polygon import find_defect
-from wholearm_jax.model.scene import COORDINATES, LINKS, Hand, Phase, Scene, contact_formation, path_target, parse_contact, polygon
+from wholearm_jax.core import as_device_array, write_atomically
+from wholearm_jax.model import (
+    COORDINATES,
+    LINKS,
+    Hand,
+    Phase,
+    Scene,
+    contact_formation,
+    find_defect,
+    parse_contact,
+    path_target,
+    polygon,
+)
 
 CONSTRAINTS = 4
 
@@ -235,7 +244,13 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
         object=polygon(shape.vertices, shape.mass, each, shape.inertia, shape.center_of_mass),
         start=as_device_array([getattr(checked.start, c) for c in COORDINATES]),
         phases=tuple(
-            Phase(p.name, contact_formation(p.contacts), path_target(p.toward, p.until), as_device_array(p.duration, float), _arrive(p))
+            Phase(
+                p.name,
+                contact_formation(p.contacts),
+                path_target(p.toward, p.until),
+                as_device_array(p.duration, float),
+                _arrive(p),
+            )
             for p in checked.phase
         ),
     )
@@ -313,7 +328,7 @@ def to_dict(scene: Scene) -> dict[str, Any]:
 
 
 def _phase_dict(phase: Phase) -> dict[str, Any]:
-    way = phase.heading
+    way = phase.target
     row: dict[str, Any] = {"name": phase.name, "contacts": list(phase.formation.names)}
     if phase.arrive == "hold":
         return row | {"hold": True, "duration": float(phase.duration)}

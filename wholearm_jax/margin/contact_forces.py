@@ -21,12 +21,16 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.lookup import take_row
-from wholearm_jax.dynamics.path_dynamics import PathDynamics, evaluate_dot, differentiate_polynomial, evaluate_polynomial, locate_panel
-from wholearm_jax.model.schedule import PhaseSchedule, torque_at
-from wholearm_jax.simulation.event_step import path_acceleration, solver_step
-from wholearm_jax.simulation.integrator import IntegratorOptions
-from wholearm_jax.simulation.phase_motion import Motion
+from wholearm_jax.core import take_row
+from wholearm_jax.dynamics import (
+    PathDynamics,
+    differentiate_polynomial,
+    evaluate_dot,
+    evaluate_polynomial,
+    locate_panel,
+)
+from wholearm_jax.model import PhaseSchedule, torque_at
+from wholearm_jax.simulation import IntegratorOptions, Motion, path_acceleration, solver_step
 
 SAMPLES_PER_STEP = 7  # places in a step at which forces are sampled before the minimum is refined
 MAX_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
@@ -39,44 +43,50 @@ class MarginResult(NamedTuple):
     """The least slack of a phase: `margin` [N], its time as a share of the phase, its `s` and the number of its row in
     the formation, `contact`.
 
-    `lost` is the share at which a contact first pulls or slips (infinite if none does), `lost_contact` its row.
+    `loss_time` is the share at which a contact first pulls or slips (infinite if none does), `loss_contact` its row.
     """
 
     margin: Float[Array, ""]
-    share: Float[Array, ""]
+    phase_time: Float[Array, ""]
     s: Float[Array, ""]
     contact: Int[Array, ""]
-    lost: Float[Array, ""]
-    lost_contact: Int[Array, ""]
+    loss_time: Float[Array, ""]
+    loss_contact: Int[Array, ""]
 
 
 class DenseOutput(eqx.Module):
     """The steps of a motion as quintics: everything that forces within step `i` depend on."""
 
-    share: Float[Array, "steps 2"]
+    phase_time: Float[Array, "steps 2"]
     quintic: Float[Array, "steps 6"]
-    piece: Int[Array, "steps"]
+    segment: Int[Array, "steps"]
     row: Int[Array, "steps"]
-    held: Bool[Array, "steps"]
+    at_rest: Bool[Array, "steps"]
     live: Bool[Array, "steps"]
 
 
-def dense_output(table: PathDynamics, seen: PhaseSchedule, duration: Float[Array, ""], motion: Motion) -> DenseOutput:
+def dense_output(
+    dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration: Float[Array, ""], motion: Motion
+) -> DenseOutput:
     """The steps of a motion as arcs."""
     # A step that takes no time has no speed of its own: its neighbours hold what is before it and behind.
-    live = (jnp.arange(motion.held.shape[0]) < motion.count) & (motion.share[1:] > motion.share[:-1])
-    share, s = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (motion.share, motion.s))
-    w = jnp.stack([motion.entry_w, motion.w[1:]], axis=1)
+    live = (jnp.arange(motion.at_rest.shape[0]) < motion.count) & (motion.phase_time[1:] > motion.phase_time[:-1])
+    phase_time, s = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (motion.phase_time, motion.s))
+    w = jnp.stack([motion.w_begin, motion.w[1:]], axis=1)
     each = jax.vmap(quintic_hermite, (None, None, None, 0, 0, 0, 0, 0, 0))
-    quintic = each(table, seen, duration, share, s, w, motion.piece, motion.row, live & ~motion.held)
-    return DenseOutput(share, quintic, motion.piece, motion.row, motion.held, live)
+    quintic = each(
+        dynamics, phase_schedule, duration, phase_time, s, w, motion.segment, motion.row, live & ~motion.at_rest
+    )
+    return DenseOutput(phase_time, quintic, motion.segment, motion.row, motion.at_rest, live)
 
 
-def quintic_hermite(table: PathDynamics, seen: PhaseSchedule, duration, share, s, w, piece, row, moving) -> Float[Array, "6"]:
+def quintic_hermite(
+    dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, phase_time, s, w, segment, row, moving
+) -> Float[Array, "6"]:
     """The quintic Hermite arc in `xi` in [0, 1] between a step's two ends; `s` stays where nothing moves."""
-    width = share[1] - share[0]
+    width = phase_time[1] - phase_time[0]
     bend = jax.vmap(path_acceleration, (None, None, None, None, None, 0, 0, 0))(
-        table, seen, duration, piece, row, share, s, w
+        dynamics, phase_schedule, duration, segment, row, phase_time, s, w
     )
     d0, d1 = jnp.where(moving, w * width, 0.0)
     b0, b1 = jnp.where(moving, bend * width**2, 0.0)
@@ -97,29 +107,33 @@ def quintic_hermite(table: PathDynamics, seen: PhaseSchedule, duration, share, s
 
 def evaluate_dense(one: DenseOutput, xi: Float[Array, ""]):
     """Share, `s` and `w` at `xi` of one arc (no leading axis)."""
-    width = one.share[1] - one.share[0]
+    width = one.phase_time[1] - one.phase_time[0]
     s = evaluate_polynomial(one.quintic, xi)
     slope = evaluate_polynomial(differentiate_polynomial(one.quintic), xi)
-    moving = one.live & ~one.held
-    return one.share[0] + xi * width, s, jnp.where(moving, slope / jnp.where(moving, width, 1.0), 0.0)
+    moving = one.live & ~one.at_rest
+    return one.phase_time[0] + xi * width, s, jnp.where(moving, slope / jnp.where(moving, width, 1.0), 0.0)
 
 
-def contact_force(table: PathDynamics, seen: PhaseSchedule, duration, piece, row, share, s, w) -> Float[Array, "slots"]:
+def contact_force(
+    dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, segment, row, phase_time, s, w
+) -> Float[Array, "rows"]:
     """Constraint forces [N] for forward travel: `c_n`, and `c_t` in tangential rows."""
-    panel, xi = locate_panel(table, piece, s)
+    panel, xi = locate_panel(dynamics, segment, s)
     v = w / duration
     rest = jnp.stack([jnp.ones_like(v), v**2, v])
-    return evaluate_dot(table.force, panel, xi, jnp.concatenate([rest, torque_at(seen, row, share)]))
+    return evaluate_dot(dynamics.force, panel, xi, jnp.concatenate([rest, torque_at(phase_schedule, row, phase_time)]))
 
 
-def force_slack(table: PathDynamics, forces: Float[Array, "slots"]) -> Float[Array, "slots"]:
+def force_slack(dynamics: PathDynamics, forces: Float[Array, "rows"]) -> Float[Array, "rows"]:
     """What of constraint forces counts toward the margin [N]: `c_n`, and `mu c_n - |c_t|` in tangential rows."""
-    cone = table.grip * jnp.roll(forces, 1) - jnp.abs(forces)  # a contact's normal row stands before its tangential one
-    return jnp.where(table.tangential, cone, forces)
+    cone = dynamics.rolling_friction * jnp.roll(forces, 1) - jnp.abs(
+        forces
+    )  # a contact's normal row stands before its tangential one
+    return jnp.where(dynamics.tangential, cone, forces)
 
 
 def cone_facets(
-    table: PathDynamics, forces: Float[Array, "slots *terms"], rolling: int = MAX_ROLLING
+    dynamics: PathDynamics, forces: Float[Array, "rows *terms"], rolling: int = MAX_ROLLING
 ) -> Float[Array, "rows *terms"]:
     """Linear functions of the forces whose least is the least `force_slack`: both sides of each friction cone.
 
@@ -128,74 +142,90 @@ def cone_facets(
     first.
     """
     column = (slice(None), *(None,) * (forces.ndim - 1))
-    normal = table.grip[column] * jnp.roll(forces, 1, axis=0)
-    one_side = jnp.where(table.tangential[column], normal - forces, forces)
-    (rows,) = jnp.nonzero(table.tangential, size=rolling, fill_value=-1)
+    normal = dynamics.rolling_friction[column] * jnp.roll(forces, 1, axis=0)
+    one_side = jnp.where(dynamics.tangential[column], normal - forces, forces)
+    (rows,) = jnp.nonzero(dynamics.tangential, size=rolling, fill_value=-1)
     other = jnp.where((rows >= 0)[column], (normal + forces)[rows], forces[0])
     return jnp.concatenate([one_side, other])
 
 
-def is_duplicate_facet(table: PathDynamics) -> Bool[Array, "rows"]:
+def is_duplicate_facet(dynamics: PathDynamics) -> Bool[Array, "rows"]:
     """Which of `cone_facets` repeat another."""
-    slots = table.tangential.shape[0]
-    return jnp.arange(slots + MAX_ROLLING) >= slots + table.tangential.sum()
+    slots = dynamics.tangential.shape[0]
+    return jnp.arange(slots + MAX_ROLLING) >= slots + dynamics.tangential.sum()
 
 
-def slacks_at(table: PathDynamics, seen: PhaseSchedule, duration, arc: DenseOutput, xi, kind=force_slack) -> Float[Array, "rows"]:
+def slacks_at(
+    dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, arc: DenseOutput, xi, kind=force_slack
+) -> Float[Array, "rows"]:
     """`force_slack` (or `cone_facets`) at `xi` of one arc."""
-    share, s, w = evaluate_dense(arc, xi)
-    return kind(table, contact_force(table, seen, duration, arc.piece, arc.row, share, s, w))
+    phase_time, s, w = evaluate_dense(arc, xi)
+    return kind(dynamics, contact_force(dynamics, phase_schedule, duration, arc.segment, arc.row, phase_time, s, w))
 
 
 def sampled_slacks(
-    table: PathDynamics, seen: PhaseSchedule, duration, steps: DenseOutput, samples: int = SAMPLES_PER_STEP, kind=force_slack
+    dynamics: PathDynamics,
+    phase_schedule: PhaseSchedule,
+    duration,
+    steps: DenseOutput,
+    samples: int = SAMPLES_PER_STEP,
+    kind=force_slack,
 ) -> Float[Array, "steps samples rows"]:
     """`force_slack` (or `cone_facets`) at evenly spaced places of every step, ends included; infinite where all rests."""
     xi = jnp.linspace(0.0, 1.0, samples, dtype=steps.quintic.dtype)
     on = partial(slacks_at, kind=kind)
     at = jax.vmap(jax.vmap(on, (None, None, None, None, 0)), (None, None, None, 0, None))
-    values = at(table, seen, duration, steps, xi)
-    return jnp.where((steps.live & ~steps.held)[:, None, None], values, jnp.inf)
+    values = at(dynamics, phase_schedule, duration, steps, xi)
+    return jnp.where((steps.live & ~steps.at_rest)[:, None, None], values, jnp.inf)
 
 
-def minimum_margin(table: PathDynamics, seen: PhaseSchedule, duration: Float[Array, ""], motion: Motion, how: IntegratorOptions) -> MarginResult:
+def minimum_margin(
+    dynamics: PathDynamics,
+    phase_schedule: PhaseSchedule,
+    duration: Float[Array, ""],
+    motion: Motion,
+    options: IntegratorOptions,
+) -> MarginResult:
     """The margin of a simulated phase.
 
     The quintics find the place; the force there comes from one step of the solver that ends beside it, so that the
     margin is as accurate as the integration.
     """
-    steps = dense_output(table, seen, duration, motion)
-    values = _sample(*stop_gradient((table, seen, duration, steps)), motion.count)
+    steps = dense_output(dynamics, phase_schedule, duration, motion)
+    values = _sample(*stop_gradient((dynamics, phase_schedule, duration, steps)), motion.count)
 
     def at(number):
         """What a dip in a step depends on, and its place as (step, contact)."""
         step, contact = number // values.shape[2], number % values.shape[2]
         arc = jax.tree.map(lambda a: take_row(a, step), steps)
-        return (table, seen, duration, arc, take_row(motion.entry_w, step)), step, contact
+        return (dynamics, phase_schedule, duration, arc, take_row(motion.w_begin, step)), step, contact
 
     def find(number):
         """How low a dip goes, and where."""
         inputs, step, contact = stop_gradient(at(number))
-        seat, reach = jnp.argmin(take_row(take_row(values, step).T, contact)) / (SAMPLES_PER_STEP - 1), 1.0 / (SAMPLES_PER_STEP - 1)
+        seat, reach = (
+            jnp.argmin(take_row(take_row(values, step).T, contact)) / (SAMPLES_PER_STEP - 1),
+            1.0 / (SAMPLES_PER_STEP - 1),
+        )
         low, high = jnp.maximum(seat - reach, 0.0), jnp.minimum(seat + reach, 1.0)
         xi = _golden_section(lambda xi: take_row(slacks_at(*inputs[:4], xi), contact), low, high)
-        return _refine_minimum(inputs, how, contact, xi, low, high)
+        return _refine_minimum(inputs, options, contact, xi, low, high)
 
     numbers = _lowest_samples(_candidate_minima(values).ravel(), MAX_REFINED)
     least, places = stop_gradient(jax.vmap(find)(numbers))
     best = jnp.argmin(least)
     inputs, _, contact = at(take_row(numbers, best))
     xi = take_row(places, best)
-    margin = _with_envelope_derivative(inputs, how, contact, xi, take_row(least, best))
-    share, s, _ = evaluate_dense(inputs[3], xi)
-    lost, lost_contact = _first_loss(*stop_gradient((table, seen, duration, steps)), values)
+    margin = _with_envelope_derivative(inputs, options, contact, xi, take_row(least, best))
+    phase_time, s, _ = evaluate_dense(inputs[3], xi)
+    lost, lost_contact = _first_loss(*stop_gradient((dynamics, phase_schedule, duration, steps)), values)
     between = (margin < 0) & ~jnp.isfinite(lost)  # a dip that no sample shows
-    lost = jnp.where(between, stop_gradient(share), lost)
+    lost = jnp.where(between, stop_gradient(phase_time), lost)
     lost_contact = jnp.where(between, contact, lost_contact)
-    return MarginResult(margin, share, s, contact, lost, lost_contact)
+    return MarginResult(margin, phase_time, s, contact, lost, lost_contact)
 
 
-def _sample(table, seen, duration, steps: DenseOutput, count) -> Float[Array, "steps samples rows"]:
+def _sample(dynamics, phase_schedule, duration, steps: DenseOutput, count) -> Float[Array, "steps samples rows"]:
     """`sampled_slacks` of the first `count` steps, few at a time: there is room for many more."""
     rows = steps.live.shape[0]
     few = min(FEW_CANDIDATES, rows)
@@ -203,10 +233,10 @@ def _sample(table, seen, duration, steps: DenseOutput, count) -> Float[Array, "s
     def sample(k, values):
         first = jnp.minimum(k * few, rows - few)
         block = jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, first, few), steps)
-        fresh = sampled_slacks(table, seen, duration, block)
+        fresh = sampled_slacks(dynamics, phase_schedule, duration, block)
         return jax.lax.dynamic_update_slice_in_dim(values, fresh, first, 0)
 
-    none = jnp.full((rows, SAMPLES_PER_STEP, table.tangential.shape[0]), jnp.inf, steps.quintic.dtype)
+    none = jnp.full((rows, SAMPLES_PER_STEP, dynamics.tangential.shape[0]), jnp.inf, steps.quintic.dtype)
     return jax.lax.fori_loop(0, (count + few - 1) // few, sample, none)
 
 
@@ -261,41 +291,53 @@ def _candidate_minima(values: Float[Array, "steps samples rows"]) -> Float[Array
     return jnp.where(jnp.isfinite(least), jnp.minimum(least, lowest), jnp.inf)
 
 
-def _refine_minimum(inputs, how: IntegratorOptions, contact, xi, low, high):
+def _refine_minimum(inputs, options: IntegratorOptions, contact, xi, low, high):
     """A constraint's least slack about `xi` of a step of the true motion, and where in `[low, high]` that is.
 
     To second order: the value and slope where a step of the solver ends at `xi`, the second derivative that of the
     quintic. The derivative, the place held, is that at the true minimum.
     """
-    table, seen, duration, arc, entry_w = inputs
-    width = arc.share[1] - arc.share[0]
-    share, begin = arc.share[0] + xi * width, jnp.stack([arc.quintic[0], entry_w])
-    s, w = solver_step(table, seen, duration, how, arc.piece, arc.row, arc.share[0], begin, xi * width)
+    dynamics, phase_schedule, duration, arc, w_begin = inputs
+    width = arc.phase_time[1] - arc.phase_time[0]
+    phase_time, begin = arc.phase_time[0] + xi * width, jnp.stack([arc.quintic[0], w_begin])
+    s, w = solver_step(
+        dynamics, phase_schedule, duration, options, arc.segment, arc.row, arc.phase_time[0], begin, xi * width
+    )
 
-    def at(share, s, w):
-        return take_row(force_slack(table, contact_force(table, seen, duration, arc.piece, arc.row, share, s, w)), contact)
+    def at(phase_time, s, w):
+        return take_row(
+            force_slack(
+                dynamics, contact_force(dynamics, phase_schedule, duration, arc.segment, arc.row, phase_time, s, w)
+            ),
+            contact,
+        )
 
-    bend = path_acceleration(table, seen, duration, arc.piece, arc.row, share, s, w)
-    value, slope = jax.jvp(at, (share, s, w), (jnp.ones_like(share), w, bend))
+    bend = path_acceleration(dynamics, phase_schedule, duration, arc.segment, arc.row, phase_time, s, w)
+    value, slope = jax.jvp(at, (phase_time, s, w), (jnp.ones_like(phase_time), w, bend))
     wide = jnp.where(width > 0, width, 1.0)
-    curve = _second_derivative(lambda xi: take_row(slacks_at(table, seen, duration, arc, xi), contact), xi) / wide**2
+    curve = (
+        _second_derivative(lambda xi: take_row(slacks_at(dynamics, phase_schedule, duration, arc, xi), contact), xi)
+        / wide**2
+    )
     inner = (xi > 0) & (xi < 1) & (curve > 0)
     better = jnp.clip(xi - jnp.where(inner, slope / jnp.where(inner, curve, 1.0) / wide, 0.0), low, high)
     way = stop_gradient((better - xi) * width)
     least = value + slope * way + stop_gradient(curve) * way**2 / 2
-    return jnp.where(arc.live & ~arc.held, least, jnp.inf), better
+    return jnp.where(arc.live & ~arc.at_rest, least, jnp.inf), better
 
 
 @eqx.filter_custom_jvp
-def _with_envelope_derivative(inputs, how, contact, xi, least):
+def _with_envelope_derivative(inputs, options, contact, xi, least):
     """The `plan_margin` slack that was found at `xi`, with the derivatives of `_refine_minimum`."""
     return least
 
 
 @_with_envelope_derivative.def_jvp
 def _(primals, tangents):
-    (inputs, how, contact, xi, least), (change, *_) = primals, tangents
-    _, rate = eqx.filter_jvp(lambda inputs: _refine_minimum(inputs, how, contact, xi, 0.0, 1.0)[0], (inputs,), (change,))
+    (inputs, options, contact, xi, least), (change, *_) = primals, tangents
+    _, rate = eqx.filter_jvp(
+        lambda inputs: _refine_minimum(inputs, options, contact, xi, 0.0, 1.0)[0], (inputs,), (change,)
+    )
     return least, rate
 
 
@@ -328,7 +370,7 @@ def _golden_section(function, low, high):
     return stop_gradient(jax.lax.fori_loop(0, GOLDEN_ITERATIONS, narrow, start)[2])
 
 
-def _first_loss(table, seen, duration, steps, values):
+def _first_loss(dynamics, phase_schedule, duration, steps, values):
     """The share at which a contact's slack first turns negative, by bisection from the first sample that is."""
     negative = (values < 0).any(2)  # their least would go to a library of XLA's, with threads of its own
     first = jnp.argmax(negative.ravel())
@@ -340,12 +382,12 @@ def _first_loss(table, seen, duration, steps, values):
     def halve(_, bracket):
         low, high, contact = bracket
         middle = (low + high) / 2
-        slacks = slacks_at(table, seen, duration, arc, middle)
+        slacks = slacks_at(dynamics, phase_schedule, duration, arc, middle)
         gone = slacks.min() < 0
         contact = jnp.where(gone, jnp.argmin(slacks), contact)
         return jnp.where(gone, low, middle), jnp.where(gone, middle, high), contact
 
     bracket = (jnp.maximum(high - width, 0.0), high, jnp.argmin(values[step, sample]))
     _, xi, contact = jax.lax.fori_loop(0, jnp.where(jnp.any(negative), 50, 0), halve, bracket)
-    share = evaluate_dense(arc, xi)[0]
-    return jnp.where(jnp.any(negative), share, jnp.inf), contact
+    phase_time = evaluate_dense(arc, xi)[0]
+    return jnp.where(jnp.any(negative), phase_time, jnp.inf), contact

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.dynamics.path_dynamics import PathDynamics, evaluate, locate_panel
+from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.margin.contact_forces import MAX_ROLLING, cone_facets
 
 BOUND_SPEEDS = 12  # speed intervals of the bound
@@ -33,34 +33,34 @@ class QuasistaticTorque(eqx.Module):
 
 
 class MarginBound(eqx.Module):
-    """No torque within limits keeps every slack above `value` [N] for a whole phase: `s` and `share` of the wire say
+    """No torque within limits keeps every slack above `value` [N] for a whole phase: `s` and `path_fraction` of the wire say
     where it is tight."""
 
     value: Float[Array, ""]
     s: Float[Array, ""]
-    share: Float[Array, ""]
+    path_fraction: Float[Array, ""]
 
 
-def affine_coefficients(table: PathDynamics, s: Float[Array, ""]):
+def affine_coefficients(dynamics: PathDynamics, s: Float[Array, ""]):
     """Coefficients of `a` (5) and of the forces (slots x 5) at `s`, in the piece that holds it."""
-    panel, xi = _place(table, s)
-    return evaluate(table.acceleration, panel, xi), evaluate(table.force, panel, xi)
+    panel, xi = _place(dynamics, s)
+    return evaluate(dynamics.acceleration, panel, xi), evaluate(dynamics.force, panel, xi)
 
 
-def acceleration_terms(table: PathDynamics, s: Float[Array, ""]) -> Float[Array, "5"]:
+def acceleration_terms(dynamics: PathDynamics, s: Float[Array, ""]) -> Float[Array, "5"]:
     """Those of `a` alone."""
-    return evaluate(table.acceleration, *_place(table, s))
+    return evaluate(dynamics.acceleration, *_place(dynamics, s))
 
 
-def _place(table: PathDynamics, s):
-    inner = table.breaks[1:-1]
-    return locate_panel(table, jnp.minimum((s >= inner).sum(), table.count - 1), s)
+def _place(dynamics: PathDynamics, s):
+    inner = dynamics.breakpoints[1:-1]
+    return locate_panel(dynamics, jnp.minimum((s >= inner).sum(), dynamics.count - 1), s)
 
 
-def best_quasistatic_torque(table: PathDynamics, s, v=0.0, a=0.0) -> QuasistaticTorque:
+def best_quasistatic_torque(dynamics: PathDynamics, s, v=0.0, a=0.0) -> QuasistaticTorque:
     """Torques that give the motion `(v, a)` at `s` [1/s, 1/s^2] with the largest least slack, in closed form."""
-    motion, force = affine_coefficients(table, s)
-    force = cone_facets(table, force)
+    motion, force = affine_coefficients(dynamics, s)
+    force = cone_facets(dynamics, force)
     one = jnp.ones_like(s)
     speed = jnp.stack([one, v**2 * one, v * one])
     pull = motion[3:]
@@ -71,7 +71,7 @@ def best_quasistatic_torque(table: PathDynamics, s, v=0.0, a=0.0) -> Quasistatic
     slope = force[:, 3:] @ free
     steep = jnp.abs(free) > 1e-12
     safe = jnp.where(steep, free, 1.0)
-    ends = jnp.stack([(-table.torque_limit - base) / safe, (table.torque_limit - base) / safe])
+    ends = jnp.stack([(-dynamics.torque_limit - base) / safe, (dynamics.torque_limit - base) / safe])
     low = jnp.where(steep, ends.min(0), -jnp.inf).max()
     high = jnp.where(steep, ends.max(0), jnp.inf).min()
     one_side, other = np.array(list(itertools.combinations(range(slope.shape[0]), 2))).T
@@ -80,18 +80,20 @@ def best_quasistatic_torque(table: PathDynamics, s, v=0.0, a=0.0) -> Quasistatic
     tries = jnp.clip(jnp.concatenate([jnp.stack([low, high]), meets]), low, high)
     least = (offset + tries[:, None] * slope).min(1)
     best = jnp.argmax(least)
-    within = steep | (jnp.abs(base) <= table.torque_limit)  # a torque that is the same along all of the squeeze
+    within = steep | (jnp.abs(base) <= dynamics.torque_limit)  # a torque that is the same along all of the squeeze
     possible = (low <= high) & jnp.all(within) & jnp.all(jnp.isfinite(least))
     margin = jnp.where(possible, least[best], -jnp.inf)
     return QuasistaticTorque(base + tries[best] * free, margin)
 
 
-def best_quasistatic_torque_batch(table: PathDynamics, s, v, a) -> QuasistaticTorque:
+def best_quasistatic_torque_batch(dynamics: PathDynamics, s, v, a) -> QuasistaticTorque:
     """`best_quasistatic_torque` at many places."""
-    return jax.vmap(best_quasistatic_torque, (None, 0, 0, 0))(table, s, v, a)
+    return jax.vmap(best_quasistatic_torque, (None, 0, 0, 0))(dynamics, s, v, a)
 
 
-def margin_upper_bound(table: PathDynamics, duration: Float[Array, ""], from_rest=True, to_rest=True, rolling: int = MAX_ROLLING) -> MarginBound:
+def margin_upper_bound(
+    dynamics: PathDynamics, duration: Float[Array, ""], from_rest=True, to_rest=True, rolling: int = MAX_ROLLING
+) -> MarginBound:
     """An upper bound on the margin of a phase along a wire that starts, and ends, at rest or moving.
 
     At each of many places the least slack is maximised over torques within limits and over speeds up to `MAX_SPEED_RATIO` wire
@@ -99,18 +101,18 @@ def margin_upper_bound(table: PathDynamics, duration: Float[Array, ""], from_res
     speed is 0 and the acceleration may point only forward (start) or backward (end). The smallest of these bounds the
     phase. What no more than `rolling` contacts can need is left out: without any, it takes less than half the time.
     """
-    fastest = MAX_SPEED_RATIO * table.length / duration
+    fastest = MAX_SPEED_RATIO * dynamics.length / duration
     speeds = fastest * jnp.linspace(0.0, 1.0, BOUND_SPEEDS + 1) ** 2
-    places = table.breaks[0] + table.length * jnp.linspace(0.0, 1.0, BOUND_PLACES + 1)
-    motion, force = jax.vmap(partial(affine_coefficients, table))(places)
-    force = jax.vmap(partial(cone_facets, table, rolling=rolling))(force)[:, None]
+    places = dynamics.breakpoints[0] + dynamics.length * jnp.linspace(0.0, 1.0, BOUND_PLACES + 1)
+    motion, force = jax.vmap(partial(affine_coefficients, dynamics))(places)
+    force = jax.vmap(partial(cone_facets, dynamics, rolling=rolling))(force)[:, None]
     still, square, linear, slope = force[..., 0], force[..., 1], force[..., 2], force[..., 3:]
 
     low, high = speeds[:-1, None], speeds[1:, None]
     moving = still + jnp.maximum(square * low**2, square * high**2) + jnp.maximum(linear * low, linear * high)
     ends, sign = jnp.array([0, BOUND_PLACES]), jnp.array([1.0, -1.0])
     count = moving.shape[0] * BOUND_SPEEDS
-    best = jax.vmap(partial(_best, table))(
+    best = jax.vmap(partial(_best, dynamics))(
         jnp.concatenate([moving.reshape(count, -1), still[ends, 0]]),
         jnp.concatenate([jnp.repeat(slope[:, 0], BOUND_SPEEDS, axis=0), slope[ends, 0]]),
         jnp.concatenate([jnp.zeros((count, 2)), sign[:, None] * motion[ends, 3:]]),
@@ -128,9 +130,9 @@ def _rows(slacks: int) -> Int[np.ndarray, "vertices 3"]:
     return np.array([t for t in triples if t[0] < slacks])
 
 
-def _best(table, offset, slope, pull, push):
+def _best(dynamics, offset, slope, pull, push):
     """Largest `m` with `offset + slope tau >= m`, `|tau| <= limit` and `pull.tau + push >= 0`, by its vertices."""
-    limit = table.torque_limit
+    limit = dynamics.torque_limit
     one, none = jnp.ones_like(offset), jnp.zeros(5, offset.dtype)
     # Row (p, q): p.(tau1, tau2, m) + q >= 0.
     box = jnp.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], offset.dtype)

@@ -20,22 +20,30 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.model.contact_kinematics import normal_jacobian, tangential_jacobian
-from wholearm_jax.model.mechanics import scaled_mechanics
-from wholearm_jax.model.scene import ContactFormation, Scene, rigid_body
-from wholearm_jax.model.schedule import TorqueSchedule, time_tolerance
+from wholearm_jax.model import (
+    ContactFormation,
+    Scene,
+    TorqueSchedule,
+    normal_jacobian,
+    rigid_body,
+    scaled_mechanics,
+    tangential_jacobian,
+    time_tolerance,
+)
 
 FEASIBILITY_TOL = -1e-8  # least margin that counts as possible, over the unit of force: rounding
 SOLVER_TOL = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 MARGIN_CAP = 1e6  # the largest margin, over the unit of force: friction may let forces grow without end
 NO_ROWS = np.zeros((0, 3))
-MARGIN_TIE = 0.99  # share of the best margin for which a hold's torque moves away from where the object would start to move
+MARGIN_TIE = (
+    0.99  # share of the best margin for which a hold's torque moves away from where the object would start to move
+)
 
 
 class RestInterval(NamedTuple):
     """An object at rest for a while: `start` and `end` [s], its least margin [N], when, and at which contact.
 
-    `lost` is the time from which no forces can hold it there, None where some always can.
+    `loss_time` is the time from which no forces can hold it there, None where some always can.
     """
 
     start: float
@@ -43,14 +51,14 @@ class RestInterval(NamedTuple):
     margin: float
     time: float
     contact: str
-    lost: float | None
+    loss_time: float | None
 
     @property
     def message(self) -> str:
         """What friction holds, in one line."""
         span = f"held at rest from {self.start:.4g} to {self.end:.4g} s"
-        if self.lost is not None:
-            return f"{span}: not possible from t = {self.lost:.6g} s, {self.contact} would have to pull"
+        if self.loss_time is not None:
+            return f"{span}: not possible from t = {self.loss_time:.6g} s, {self.contact} would have to pull"
         return f"{span}, hold's margin {self.margin:.4g} N at {self.contact}"
 
 
@@ -105,7 +113,7 @@ class Statics:
         central = self._maximise(limits, (0.0, None), floor=MARGIN_TIE * top.margin / self.unit, still=still, apart=1.0)
         return self.support(self._torque(central)) if central.status == 0 else top
 
-    def lost(self, before, after) -> float:
+    def loss_fraction(self, before, after) -> float:
         """The share of the way between two torques from which no forces hold the object: 1 if some always do."""
         ends = np.stack([before, after])
         limits = np.column_stack([ends.min(0), ends.max(0)])
@@ -163,7 +171,7 @@ class Statics:
 def contact_statics(scene: Scene, formation: ContactFormation, z: Float[Array, "5"]) -> Statics:
     """The balance of forces for an object at rest at `z` (SI) in a formation, of however many contacts."""
     mechanics, normal, slip = jax.device_get(_rows(scene, formation, z))
-    slots, joints = list(formation.normal_slots), np.eye(5)[:, 3:]
+    slots, joints = list(formation.normal_rows), np.eye(5)[:, 3:]
     force, radius = float(mechanics.force_unit), float(mechanics.length)
     weight = np.append(mechanics.inertia[0] * mechanics.gravity * force, np.zeros(3))
     unit = float(np.abs(weight).max() + mechanics.torque_limit.max() / radius)
@@ -195,7 +203,7 @@ def rest_margin(balance: Statics, schedule: TorqueSchedule, start: float, end: f
     lost, which = None, supports[worst].contact
     if bad is not None:
         which = supports[bad].contact
-        share = balance.lost(torques[bad - 1], torques[bad]) if bad > 0 else 1.0
+        share = balance.loss_fraction(torques[bad - 1], torques[bad]) if bad > 0 else 1.0
         lost = times[max(bad - 1, 0)] + share * (times[bad] - times[max(bad - 1, 0)])
     return RestInterval(start, end, supports[worst].margin, times[worst], which, lost)
 

@@ -11,24 +11,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from wholearm_jax.model.contact_kinematics import ContactSet, contact_set, obstacle_candidates
-from wholearm_jax.model.scene import EDGE, VERTEX, RigidBody, ContactFormation, Hand, next_vertex
+from wholearm_jax.model.kinematics import ContactSet, contact_set, obstacle_candidates
+from wholearm_jax.model.scene import EDGE, VERTEX, ContactFormation, Hand, RigidBody, next_vertex
 
 
 class ScaledMechanics(eqx.Module):
     """A formation on a hand, dimensionless but for time.
 
     `inertia` is the diagonal of `M = diag(m, m, I, J1, J2)`; `viscous` and `dry` are B and D; `gravity` is an
-    acceleration. `candidates` are all pairs that may touch, `real` those of features that the object has; `watched`
-    marks those that could end the formation, `behind` vertices that may lie behind a link, whose back stops them.
+    acceleration. `candidates` are all pairs that may touch, `exists` those of features that the object has; `may_terminate`
+    marks those that could end the formation, `may_be_behind` vertices that may lie behind a link, whose back stops them.
     `length` [m] and `mass` [kg] are the units; `torque_limit` stays in N m.
     """
 
     contacts: ContactSet
     candidates: ContactSet
-    real: Bool[Array, "candidates"]
-    watched: Bool[Array, "candidates"]
-    behind: Bool[Array, "candidates"]
+    exists: Bool[Array, "candidates"]
+    may_terminate: Bool[Array, "candidates"]
+    may_be_behind: Bool[Array, "candidates"]
     inertia: Float[Array, "5"]
     viscous: Float[Array, "2"]
     dry: Float[Array, "2"]
@@ -59,7 +59,9 @@ def configuration_unit(length: Float[Array, ""]) -> Float[Array, "5"]:
     return jnp.stack([length, length, one, one, one])
 
 
-def scaled_mechanics(body: RigidBody, hand: Hand, gravity: Float[Array, "2"], formation: ContactFormation) -> ScaledMechanics:
+def scaled_mechanics(
+    body: RigidBody, hand: Hand, gravity: Float[Array, "2"], formation: ContactFormation
+) -> ScaledMechanics:
     """Scale a formation by the object's size and mass."""
     real = jnp.arange(body.vertices.shape[0]) < body.count
     length, mass = jnp.sqrt(jnp.where(real, (body.vertices**2).sum(1), 0.0).max()), body.mass
@@ -80,9 +82,9 @@ def scaled_mechanics(body: RigidBody, hand: Hand, gravity: Float[Array, "2"], fo
     return ScaledMechanics(
         contacts=contact_set(small_body, small_hand, formation),
         candidates=contact_set(small_body, small_hand, pairs),
-        real=touchable,
-        watched=touchable & ~_coincides_with_contact(pairs, formation, body.count),
-        behind=_may_be_behind(pairs, formation, _is_convex(body)),
+        exists=touchable,
+        may_terminate=touchable & ~_coincides_with_contact(pairs, formation, body.count),
+        may_be_behind=_may_be_behind(pairs, formation, _is_convex(body)),
         inertia=jnp.concatenate([heavy, small_hand.inertia]),
         viscous=small_hand.viscous,
         dry=small_hand.dry,

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.arrays import as_device_array
+from wholearm_jax.core import as_device_array
 
 COORDINATES = ("x", "y", "phi", "theta1", "theta2")
 LINKS = ("palm", "finger1", "finger2")
@@ -71,10 +71,10 @@ class ContactFormation(eqx.Module):
     marked `tangential`. Four rows make a wire: `2R + S = 4`.
     """
 
-    link: Int[Array, "slots"]
-    kind: Int[Array, "slots"]
-    feature: Int[Array, "slots"]
-    tangential: Bool[Array, "slots"]
+    link: Int[Array, "rows"]
+    kind: Int[Array, "rows"]
+    feature: Int[Array, "rows"]
+    tangential: Bool[Array, "rows"]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -87,12 +87,12 @@ class ContactFormation(eqx.Module):
         return tuple(contact_name(*row[:3], rolling=row[3]) for row in rows if not row[4])
 
     @property
-    def normal_slots(self) -> tuple[int, ...]:
+    def normal_rows(self) -> tuple[int, ...]:
         """The row of each contact's gap."""
         return tuple(np.flatnonzero(~np.asarray(self.tangential)).tolist())
 
     @property
-    def contact_of_slot(self) -> tuple[int, ...]:
+    def contact_of_row(self) -> tuple[int, ...]:
         """Which of `names` each row belongs to."""
         return tuple((np.cumsum(~np.asarray(self.tangential)) - 1).tolist())
 
@@ -120,7 +120,7 @@ class Phase(eqx.Module):
 
     name: str = eqx.field(static=True)
     formation: ContactFormation
-    heading: PathTarget
+    target: PathTarget
     duration: Float[Array, ""]
     arrive: str = eqx.field(static=True, default="rest")
 

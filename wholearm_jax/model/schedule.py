@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core.arrays import as_device_array
-from wholearm_jax.core.lookup import take_row
+from wholearm_jax.core import as_device_array, take_row
 
 ROW_MULTIPLE = 128  # schedules are padded to a multiple of this: those of like length share compiled programs
 TIME_ROUNDING = 16  # times beside each other by this many of a precision's last digits are one
@@ -26,13 +25,13 @@ class TorqueSchedule(eqx.Module):
 
 
 class PhaseSchedule(eqx.Module):
-    """A schedule seen from one phase: `share` is time in durations of the phase, 0 at its start and 1 at its end.
+    """A schedule seen from one phase: `phase_time` is time in durations of the phase, 0 at its start and 1 at its end.
 
     Interval `k` runs from row `k` to row `k + 1`; those from `first` to `last` cover the phase. `slope` is the torque's
     rate per duration.
     """
 
-    share: Float[Array, "rows"]
+    phase_time: Float[Array, "rows"]
     values: Float[Array, "rows 2"]
     slope: Float[Array, "rows_less_1 2"]
     first: Int[Array, ""]
@@ -44,9 +43,9 @@ def torque_schedule(times, values) -> TorqueSchedule:
 
     Raises `ValueError` unless there are at least two rows, all finite, with times sorted and none more than twice.
 
-    >>> wa.torque([0.0, 1.0], [[0.5, -0.2], [0.5, -0.4]]).values.shape
+    >>> wa.torque_schedule([0.0, 1.0], [[0.5, -0.2], [0.5, -0.4]]).values.shape
     (2, 2)
-    >>> wa.torque([1.0, 0.0], [[0.5, -0.2], [0.5, -0.4]])
+    >>> wa.torque_schedule([1.0, 0.0], [[0.5, -0.2], [0.5, -0.4]])
     Traceback (most recent call last):
     ValueError: times must not decrease, and none may stand more than twice
     """
@@ -79,7 +78,9 @@ def concatenate_schedules(schedules: list[TorqueSchedule]) -> TorqueSchedule:
     """Schedules one after the other, each from time 0; a step where one follows another."""
     begins = np.cumsum([0.0, *(float(np.asarray(s.times)[-1]) for s in schedules[:-1])])
     times = [begin + np.asarray(s.times) for begin, s in zip(begins, schedules, strict=True)]
-    return TorqueSchedule(*(as_device_array(np.concatenate(rows)) for rows in (times, [np.asarray(s.values) for s in schedules])))
+    return TorqueSchedule(
+        *(as_device_array(np.concatenate(rows)) for rows in (times, [np.asarray(s.values) for s in schedules]))
+    )
 
 
 def has_jumps(schedule: TorqueSchedule, start: float, end: float) -> bool:
@@ -123,7 +124,7 @@ def restrict_to_phase(schedule: TorqueSchedule, start: Float[Array, ""], duratio
     last = (times < start + duration - near).sum() - 1
     first = jnp.clip(first, 0, intervals - 1)
     return PhaseSchedule(
-        share=(times - start) / duration,
+        phase_time=(times - start) / duration,
         values=schedule.values,
         slope=slope,
         first=first,
@@ -131,11 +132,13 @@ def restrict_to_phase(schedule: TorqueSchedule, start: Float[Array, ""], duratio
     )
 
 
-def interval(seen: PhaseSchedule, share: Float[Array, ""]) -> Int[Array, ""]:
+def interval(phase_schedule: PhaseSchedule, phase_time: Float[Array, ""]) -> Int[Array, ""]:
     """The interval that holds at a share of the phase; a step belongs to what follows it, except at the phase's end."""
-    return jnp.clip((share >= seen.share).sum() - 1, seen.first, seen.last)
+    return jnp.clip((phase_time >= phase_schedule.phase_time).sum() - 1, phase_schedule.first, phase_schedule.last)
 
 
-def torque_at(seen: PhaseSchedule, number: Int[Array, ""], share: Float[Array, ""]) -> Float[Array, "2"]:
+def torque_at(phase_schedule: PhaseSchedule, number: Int[Array, ""], phase_time: Float[Array, ""]) -> Float[Array, "2"]:
     """The torque [N m] of one interval at a share of the phase."""
-    return take_row(seen.values, number) + take_row(seen.slope, number) * (share - take_row(seen.share, number))
+    return take_row(phase_schedule.values, number) + take_row(phase_schedule.slope, number) * (
+        phase_time - take_row(phase_schedule.phase_time, number)
+    )

@@ -16,21 +16,17 @@ import jax
 import numpy as np
 import optax
 
-from wholearm_jax.core.arrays import as_device_array
-from wholearm_jax.core.status import Status
-from wholearm_jax.margin.quasistatic import MarginBound
-from wholearm_jax.model.scene import Phase, Scene
-from wholearm_jax.model.schedule import TorqueSchedule, uniform_schedule, concatenate_schedules, pad_schedule
+from wholearm_jax.core import Status, as_device_array
+from wholearm_jax.margin import MarginBound
+from wholearm_jax.model import Phase, Scene, TorqueSchedule, concatenate_schedules, pad_schedule, uniform_schedule
 from wholearm_jax.optimisation.initial_guess import initial_guesses
 from wholearm_jax.optimisation.interior_point import interior_point, projected
 from wholearm_jax.optimisation.linearisation import Limits
 from wholearm_jax.optimisation.multiple_shooting import Variables, extra_parts
 from wholearm_jax.optimisation.rest_transition import RestTransition
-from wholearm_jax.optimisation.solver import CONVERGED, REPEATED, Problem, IterationRecord, solve
-from wholearm_jax.phases.phase import TracedPhase, simulate_phase
-from wholearm_jax.phases.plan import stack_trees
-from wholearm_jax.phases.result import rest_intervals
-from wholearm_jax.simulation.integrator import IntegratorOptions, with_step_capacity
+from wholearm_jax.optimisation.solver import CONVERGED, REPEATED, IterationRecord, Problem, solve
+from wholearm_jax.phases import TracedPhase, rest_intervals, simulate_phase, stack_trees
+from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
 TORQUE_SHARE = 0.9  # share of the torque limits that a start may use
 SHORTEST = 0.01  # share of its longest time that a phase moves at the least
@@ -59,7 +55,7 @@ class CoupledPhases:
     index: int
     phases: tuple[Phase, ...]
     traced: list[TracedPhase]
-    tops: list[MarginBound]
+    certificates: list[MarginBound]
     begin: RestTransition | None  # where torque rates are limited, and a phase stands before
     end: RestTransition | None  # or behind
     wanted: OptimiseOptions
@@ -74,7 +70,7 @@ class CoupledPhases:
     @property
     def most(self) -> float:
         """The share of the bounds that the torques at both ends allow."""
-        changes = [change.share for change in (self.begin, self.end) if change is not None and change.serves]
+        changes = [change.margin_fraction for change in (self.begin, self.end) if change is not None and change.serves]
         return min([1.0, *changes])
 
     @property
@@ -91,16 +87,16 @@ class CoupledPhases:
     @property
     def limits(self) -> np.ndarray:
         """The largest torques of each [N m]."""
-        return np.stack([np.asarray(at.table.torque_limit) for at in self.traced])
+        return np.stack([np.asarray(at.dynamics.torque_limit) for at in self.traced])
 
     @property
     def bounds(self) -> np.ndarray:
-        return np.array([float(top.value) for top in self.tops])
+        return np.array([float(top.value) for top in self.certificates])
 
     def problem(self, limits: Limits) -> Problem:
         """What is descended on."""
-        tables = stacked_tables([at.table for at in self.traced])
-        return Problem(self.index, tables, self.bounds, limits, self.wanted.steps, self.wanted.tolerance)
+        phase_dynamics = stacked_tables([at.dynamics for at in self.traced])
+        return Problem(self.index, phase_dynamics, self.bounds, limits, self.wanted.steps, self.wanted.tolerance)
 
 
 def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> tuple[list[TorqueSchedule], str, list[IterationRecord]]:
@@ -110,19 +106,19 @@ def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> tuple[list[Torqu
     """
     wanted, tolerance = group.wanted, group.wanted.tolerance
     for at in group.traced:
-        if int(at.table.status) != Status.OK:
-            why = f"the wire cannot be followed: {Status(int(at.table.status)).label}"
+        if int(at.dynamics.status) != Status.OK:
+            why = f"the wire cannot be followed: {Status(int(at.dynamics.status)).label}"
             return [uniform_schedule(t, np.zeros((wanted.knots, 2))) for t in group.durations], why, []
-    begins = initial_guesses([at.table for at in group.traced], group.durations, wanted.knots, TORQUE_SHARE)
+    begins = initial_guesses([at.dynamics for at in group.traced], group.durations, wanted.knots, TORQUE_SHARE)
     weakest = int(np.argmin(group.bounds))
     if group.bounds[weakest] <= 0:
-        where = 100 * float(group.tops[weakest].share)
+        where = 100 * float(group.certificates[weakest].path_fraction)
         why = f"no torque within limits holds this formation at {where:.0f} % of its wire"
         return _schedules(group, begins[0]), why, []
     if group.begin is not None and not group.begin.serves:
         return _schedules(group, begins[0]), "no torque lets this formation take over at the limited rate", []
     problem = group.problem(_limits(group))
-    method = descent_method(wanted.optimiser, len(group.phases), extra_parts(problem.tables))
+    method = descent_method(wanted.optimiser, len(group.phases), extra_parts(problem.phase_dynamics))
     found, history = [], []
     for number, start in enumerate(begins):
         for at, torque in group.pins.items():
@@ -156,17 +152,20 @@ def _schedules(group: CoupledPhases, p: Variables) -> list[TorqueSchedule]:
 
 def _verify_by_simulation(scene: Scene, group: CoupledPhases, p: Variables) -> tuple[bool, float]:
     """Whether a simulation of the schedules says `ok`, holds included, and the least margin over its bound."""
-    start, shares, fine, arriving = 0.0, [], [], None
+    start, shares, fine, incoming_velocity = 0.0, [], [], None
     torque = concatenate_schedules(_schedules(group, p))
-    schedule, how = pad_schedule(torque, group.wanted.rows), with_step_capacity(IntegratorOptions(), group.wanted.knots)
+    schedule, options = (
+        pad_schedule(torque, group.wanted.rows),
+        with_step_capacity(IntegratorOptions(), group.wanted.knots),
+    )
     ends = np.cumsum(np.exp(np.asarray(p.log_duration)) + group.lead)
     for phase, at, end, top in zip(group.phases, group.traced, ends, group.bounds, strict=True):
-        one = simulate_phase(at.table, schedule, start, end - start, how, phase.arrive, arriving)
-        start += float(one.duration) * float(np.asarray(one.motion.share)[int(one.motion.count)])
-        arriving = one.leaving if phase.arrive == "moving" else None
+        one = simulate_phase(at.dynamics, schedule, start, end - start, options, phase.arrive, incoming_velocity)
+        start += float(one.duration) * float(np.asarray(one.motion.phase_time)[int(one.motion.count)])
+        incoming_velocity = one.exit_velocity if phase.arrive == "moving" else None
         held = rest_intervals(scene, torque, phase, at, one)
-        fine.append(int(one.verdict.status) == Status.OK and all(h.lost is None for h in held))
-        shares.append(float(one.score.margin) / top)
+        fine.append(int(one.assessment.status) == Status.OK and all(h.loss_time is None for h in held))
+        shares.append(float(one.margin_result.margin) / top)
     least = min(shares)
     return all(fine), least if np.isfinite(least) else -np.inf
 

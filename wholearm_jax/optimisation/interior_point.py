@@ -30,10 +30,9 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core.programs import Program
-from wholearm_jax.dynamics.path_dynamics import PathDynamics
-from wholearm_jax.margin.contact_forces import log_barrier_minimum
-from wholearm_jax.margin.quasistatic import acceleration_terms
+from wholearm_jax.core import Program
+from wholearm_jax.dynamics import PathDynamics
+from wholearm_jax.margin import acceleration_terms, log_barrier_minimum
 from wholearm_jax.optimisation.linearisation import (
     Limits,
     LinearisedProblem,
@@ -44,8 +43,8 @@ from wholearm_jax.optimisation.linearisation import (
     slack_sizes,
 )
 from wholearm_jax.optimisation.multiple_shooting import Variables
-from wholearm_jax.optimisation.riccati import project_step, kkt_step
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.optimisation.riccati import kkt_step, project_step
+from wholearm_jax.simulation import IntegratorOptions
 
 MU_MAX, MU_MIN = 0.1, 1e-4  # temperatures, as shares of the bound
 NEAR = 0.95  # share of the way to a limit that a step may go
@@ -54,7 +53,9 @@ LONGEST = (0.1, 0.5)  # most that `s` and `v` at a knot may change in a step [le
 SHORTER = 0.25  # a step that leaves what can be simulated is taken again with this share of it
 SMALL = 1e-3  # a share of a step that is taken whatever becomes of the merit
 EDGE = 1e-3  # room below which the merit's logarithm goes on as its tangent
-STALL_STEP = 0.02  # share of a step, below which limits count as leaving no way: the temperature rises `MU_INCREASE` times
+STALL_STEP = (
+    0.02  # share of a step, below which limits count as leaving no way: the temperature rises `MU_INCREASE` times
+)
 MU_INCREASE = 3.0
 MU_MIN_INCREASE, MU_MIN_MAX = 4.0, 0.01  # a jam at the coldest makes that so many times warmer, but no warmer than this
 DEFECT_TOL = 1e-9  # sum of the defects below which the intervals count as joined
@@ -62,12 +63,12 @@ DEFECT_TOL = 1e-9  # sum of the defects below which the intervals count as joine
 
 class InteriorPointState(NamedTuple):
     """The interior point's own unknowns: slack and price of every room, with the intervals that their parts were of
-    (`owner`), the level `m` of the margin (NaN: not yet chosen), the temperature and the `coldest` that it may become,
+    (`interval_of_part`), the level `m` of the margin (NaN: not yet chosen), the temperature and the `coldest` that it may become,
     the shares of its last step that were taken, and the largest price of joining the intervals."""
 
     slack: Float[Array, "phases parts rooms"]
     price: Float[Array, "phases parts rooms"]
-    owner: Int[Array, "phases parts"]
+    interval_of_part: Int[Array, "phases parts"]
     level: Float[Array, ""]
     temperature: Float[Array, ""]
     coldest: Float[Array, ""]
@@ -86,7 +87,9 @@ def interior_point(phases: int, further: int) -> optax.GradientTransformationExt
         shape = (phases, knots - 1 + further, slack_sizes(knots))
         level, hot, cold = (jnp.full((), value) for value in (jnp.nan, MU_MAX, MU_MIN))
         owner = jnp.zeros(shape[:2], int)
-        return InteriorPointState(jnp.ones(shape), jnp.zeros(shape), owner, level, hot, cold, jnp.zeros(2), jnp.zeros(()))
+        return InteriorPointState(
+            jnp.ones(shape), jnp.zeros(shape), owner, level, hot, cold, jnp.zeros(2), jnp.zeros(())
+        )
 
     def update(updates, state: InteriorPointState, params=None, *, linear: LinearisedProblem, damping, **_):
         at, bears, hot = linear.at, linear.bears, state.temperature
@@ -94,7 +97,9 @@ def interior_point(phases: int, further: int) -> optax.GradientTransformationExt
         least = jnp.where(live & (bears > 0), at.room, jnp.inf).min()
         level = jnp.where(jnp.isnan(state.level), least - 2 * LEAST, state.level)
         given = jnp.where(live, at.room - bears * level, 1.0)
-        moved_on = state.owner != linear.owner  # what is known of a part is of no use to another interval's
+        moved_on = (
+            state.interval_of_part != linear.interval_of_part
+        )  # what is known of a part is of no use to another interval's
         fresh = ~(state.price > 0) | moved_on[..., None]
         slack = jnp.where(live, jnp.maximum(given, jnp.where(fresh, LEAST, state.slack)), 1.0)
         target = hot * linear.weight / slack
@@ -115,7 +120,7 @@ def interior_point(phases: int, further: int) -> optax.GradientTransformationExt
         state = InteriorPointState(
             slack + primal * dslack,
             price + dual * dprice,
-            linear.owner,
+            linear.interval_of_part,
             level + primal * rise,
             jnp.clip(hot * cooling, coldest, MU_MAX),
             coldest,
@@ -181,39 +186,44 @@ def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) ->
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
 
 
-def retract(p: Variables, way: Variables, share, tables: PathDynamics, limits: Limits) -> Variables:
-    """`p` after a `share` of a direction, on the curve along which accelerations and squeezes at knots change evenly.
+def retract(p: Variables, way: Variables, share, phase_dynamics: PathDynamics, limits: Limits) -> Variables:
+    """`p` after a `step_fraction` of a direction, on the curve along which accelerations and squeezes at knots change evenly.
 
     Torques balance to a small remainder, the acceleration: where the state at a knot moves, they have to move with it.
     The curve's tangent is the direction. A knot that passes from one piece of the wire to another goes straight.
     """
 
-    def balance(table, state, log):
+    def balance(dynamics, state, log):
         """Acceleration in lengths a duration squared is `rest + pull . torque`, the squeeze `free . torque`."""
-        motion = acceleration_terms(table, table.breaks[0] + table.length * state[0])
+        motion = acceleration_terms(dynamics, dynamics.breakpoints[0] + dynamics.length * state[0])
         time = jnp.exp(log)
-        v = state[1] * table.length / time
+        v = state[1] * dynamics.length / time
         rest = motion[0] + motion[1] * v**2 + motion[2] * v
-        pull = motion[3:] * table.torque_limit
+        pull = motion[3:] * dynamics.torque_limit
         free = jnp.stack([-pull[1], pull[0]]) / jnp.sqrt(jnp.maximum(pull @ pull, 1e-300))
-        return time**2 / table.length * rest, time**2 / table.length * pull, free
+        return time**2 / dynamics.length * rest, time**2 / dynamics.length * pull, free
 
-    def knot(table, log, dlog, state, torque, dstate, dtorque, pinned):
+    def knot(dynamics, log, dlog, state, torque, dstate, dtorque, pinned):
         def motion(state, torque, log):
-            rest, pull, free = balance(table, state, log)
+            rest, pull, free = balance(dynamics, state, log)
             return rest + pull @ torque, free @ torque
 
         (a, squeeze), (da, dsqueeze) = jax.jvp(motion, (state, torque, log), (dstate, dtorque, dlog))
         there, straight = state + share * dstate, torque + share * dtorque
-        rest, pull, free = balance(table, there, log + share * dlog)
+        rest, pull, free = balance(dynamics, there, log + share * dlog)
         size = pull @ pull
         curved = pull * (a + share * da - rest) / jnp.where(size > 0, size, 1.0) + free * (squeeze + share * dsqueeze)
-        piece = [(table.breaks[0] + table.length * s[0] >= table.breaks[1:-1]).sum() for s in (state, there)]
-        return jnp.where((piece[0] == piece[1]) & (size > 0) & ~pinned, curved, straight)
+        segment = [
+            (dynamics.breakpoints[0] + dynamics.length * s[0] >= dynamics.breakpoints[1:-1]).sum()
+            for s in (state, there)
+        ]
+        return jnp.where((segment[0] == segment[1]) & (size > 0) & ~pinned, curved, straight)
 
     knots = jax.vmap(jax.vmap(knot, (None, None, None, 0, 0, 0, 0, 0)))
     return Variables(
-        knots(tables, p.log_duration, way.log_duration, p.state, p.torque, way.state, way.torque, limits.pinned),
+        knots(
+            phase_dynamics, p.log_duration, way.log_duration, p.state, p.torque, way.state, way.torque, limits.pinned
+        ),
         p.state + share * way.state,
         p.log_duration + share * way.log_duration,
     )
@@ -233,7 +243,7 @@ class SolverState(NamedTuple):
     state: Any  # the optimiser's, with `temperature`, `coldest`, `steps` and `joining`
     before: Variables
     way: Variables
-    share: Float[Array, ""]
+    step_fraction: Float[Array, ""]
     least: Float[Array, "phases"]
     apart: Float[Array, ""]
     reach: Float[Array, ""]
@@ -271,9 +281,11 @@ def init_solver(p: Variables, optimiser) -> SolverState:
 
 
 @Program
-def take_step(d: SolverState, tables: PathDynamics, limits: Limits, how: IntegratorOptions, optimiser) -> SolverState:
+def take_step(
+    d: SolverState, phase_dynamics: PathDynamics, limits: Limits, options: IntegratorOptions, optimiser
+) -> SolverState:
     """Simulate, and take a step; where `d.p` cannot be simulated or is worse, go back and take a shorter one."""
-    linear = linearise(d.p, tables, limits, how)
+    linear = linearise(d.p, phase_dynamics, limits, options)
     at = linear.at
     sound = jnp.all(jnp.isfinite(at.room)) & jnp.all(jnp.isfinite(linear.defect))
     held = jnp.isfinite(d.rise)
@@ -286,11 +298,13 @@ def take_step(d: SolverState, tables: PathDynamics, limits: Limits, how: Integra
         way, state = optimiser.update(jnp.zeros_like(flat), d.state, flat, linear=linear, damping=d.damping)
         hot = d.state.temperature
         here = jax.lax.cond(held, lambda: merit(linear, hot, state.joining), lambda: jnp.full_like(d.merit, jnp.inf))
-        return SolverState(d.p, state, d.p, unravel(way), jnp.ones(()), least, apart, d.reach, d.rise, d.damping, here, hot)
+        return SolverState(
+            d.p, state, d.p, unravel(way), jnp.ones(()), least, apart, d.reach, d.rise, d.damping, here, hot
+        )
 
     def again():
         least, apart = (jnp.full_like(a, jnp.nan) for a in (d.least, d.apart))
-        return d._replace(share=d.share * SHORTER, least=least, apart=apart)
+        return d._replace(step_fraction=d.step_fraction * SHORTER, least=least, apart=apart)
 
-    after = jax.lax.cond(sound & (better | (d.share < SMALL)), onward, again)
-    return after._replace(p=retract(after.before, after.way, after.share * after.reach, tables, limits))
+    after = jax.lax.cond(sound & (better | (d.step_fraction < SMALL)), onward, again)
+    return after._replace(p=retract(after.before, after.way, after.step_fraction * after.reach, phase_dynamics, limits))

@@ -14,10 +14,18 @@ from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.dynamics.path_dynamics import PathDynamics, resolve_impact, evaluate, locate_panel
-from wholearm_jax.margin.contact_forces import is_duplicate_facet
-from wholearm_jax.optimisation.multiple_shooting import SPEED_COEFFICIENTS, ROWS, Samples, Variables, interval_inputs, samples_of, simulate_intervals
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel, resolve_impact
+from wholearm_jax.margin import is_duplicate_facet
+from wholearm_jax.optimisation.multiple_shooting import (
+    ROWS,
+    SPEED_COEFFICIENTS,
+    Samples,
+    Variables,
+    interval_inputs,
+    samples_of,
+    simulate_intervals,
+)
+from wholearm_jax.simulation import IntegratorOptions
 
 
 class Limits(eqx.Module):
@@ -47,36 +55,38 @@ class Slacks(NamedTuple):
 
 class LinearisedProblem(NamedTuple):
     """All intervals at `p` with derivatives: `at` and `rates` (last axis: an interval's seven numbers); the rooms'
-    `weight` (0: does not exist), the interval that each part is of (`IntervalResults.owner`); what must vanish, `defect`, and its
+    `weight` (0: does not exist), the interval that each part is of (`IntervalResults.interval_of_part`); what must vanish, `defect`, and its
     derivatives `across`; `bears` marks the rooms that the margin lowers, `still` the variables that stay."""
 
     at: Slacks
     rates: Slacks
     weight: Float[Array, "phases parts rooms"]
-    owner: Int[Array, "phases parts"]
+    interval_of_part: Int[Array, "phases parts"]
     defect: Float[Array, "e"]
     across: Float[Array, "e p"]
     bears: Float[Array, "rooms"]
     still: Bool[Array, "p"]
 
 
-def inequality_slacks(q: Float[Array, "phases intervals 7"], tables: PathDynamics, limits: Limits, how: IntegratorOptions):
+def inequality_slacks(
+    q: Float[Array, "phases intervals 7"], phase_dynamics: PathDynamics, limits: Limits, options: IntegratorOptions
+):
     """All intervals of phases that follow one another at speed, one phase after the other: rooms, and what has no
-    derivatives, `weight` and `owner` of `LinearisedProblem`."""
+    derivatives, `weight` and `interval_of_part` of `LinearisedProblem`."""
     phases, intervals = q.shape[:2]
     slowest = jnp.zeros((phases, intervals)).at[:, 0].set(limits.passing).at[0, 0].set(-jnp.inf)
     own, shared = eqx.partition(limits, OF_PHASES)
 
     def one(phase):
-        q, slowest, table, own = phase
-        shot = simulate_intervals(table, how, intervals, q)
-        first = jnp.arange(shot.owner.size) < intervals
-        least = jnp.where(first, slowest[shot.owner], 0.0)
+        q, slowest, dynamics, own = phase
+        shot = simulate_intervals(dynamics, options, intervals, q)
+        first = jnp.arange(shot.interval_of_part.size) < intervals
+        least = jnp.where(first, slowest[shot.interval_of_part], 0.0)
         each = jax.vmap(partial(_interval_slacks, intervals), (0, 0, 0, 0, None, None))
-        room, weight = each(q[shot.owner], shot.parts, first, least, table, eqx.combine(own, shared))
-        return Slacks(room, shot.end), (stop_gradient(weight), shot.owner)
+        room, weight = each(q[shot.interval_of_part], shot.parts, first, least, dynamics, eqx.combine(own, shared))
+        return Slacks(room, shot.end), (stop_gradient(weight), shot.interval_of_part)
 
-    return jax.lax.map(one, (q, slowest, tables, own))
+    return jax.lax.map(one, (q, slowest, phase_dynamics, own))
 
 
 def slack_sizes(knots: int) -> int:
@@ -84,12 +94,14 @@ def slack_sizes(knots: int) -> int:
     return samples_of(knots - 1) * ROWS + 8 + 4 + SPEED_COEFFICIENTS + 2
 
 
-def _interval_slacks(intervals: int, q: Float[Array, "7"], part: Samples, first, slowest, table: PathDynamics, limits: Limits):
+def _interval_slacks(
+    intervals: int, q: Float[Array, "7"], part: Samples, first, slowest, dynamics: PathDynamics, limits: Limits
+):
     """One part of an interval, and their weights; what does not depend on the part belongs to the `first`. `slowest` is
     the least speed with which it may begin, and -inf where it starts at rest; `limits` are those of its phase."""
     torque, log = q[2:6], q[6]
     bounded = jnp.isfinite(limits.rate)
-    step = jnp.where(bounded, limits.rate, 1.0) / table.torque_limit * jnp.exp(log) / intervals
+    step = jnp.where(bounded, limits.rate, 1.0) / dynamics.torque_limit * jnp.exp(log) / intervals
     climb = jnp.where(bounded, (torque[2:] - torque[:2]) / step, 0.0)
     span = jnp.log(limits.longest / limits.shortest)
     free = span > 0
@@ -98,7 +110,7 @@ def _interval_slacks(intervals: int, q: Float[Array, "7"], part: Samples, first,
     pace = part.pace.at[0].add(-jnp.where(later, slowest, 0.0))
     room = [(part.forces / limits.unit).ravel(), 1 - torque, 1 + torque, 1 - climb, 1 + climb, pace, ends]
     one = first / intervals
-    sampled = (part.weight[:, None] * ~is_duplicate_facet(table)).ravel()
+    sampled = (part.weight[:, None] * ~is_duplicate_facet(dynamics)).ravel()
     climbs = jnp.tile(jnp.where(bounded, one / 4, 0.0), 2)
     # From rest the first coefficient is the speed, zero, and the second the acceleration.
     paces = part.pace_weight.at[0].multiply(later).at[1].multiply(later | ~limits.pinned[0])
@@ -106,7 +118,9 @@ def _interval_slacks(intervals: int, q: Float[Array, "7"], part: Samples, first,
     return jnp.concatenate(room), jnp.concatenate(weight)
 
 
-def linearise(p: Variables, tables: PathDynamics, limits: Limits, how: IntegratorOptions) -> LinearisedProblem:
+def linearise(
+    p: Variables, phase_dynamics: PathDynamics, limits: Limits, options: IntegratorOptions
+) -> LinearisedProblem:
     """Simulate all intervals, with first derivatives by forward mode: all depend on numbers of their own, so that
     seven directions serve them all."""
     phases, knots = p.torque.shape[:2]
@@ -114,7 +128,7 @@ def linearise(p: Variables, tables: PathDynamics, limits: Limits, how: Integrato
 
     def along(way):
         changes = jnp.broadcast_to(way, q.shape)
-        return jax.jvp(lambda q: inequality_slacks(q, tables, limits, how), (q,), (changes,), has_aux=True)
+        return jax.jvp(lambda q: inequality_slacks(q, phase_dynamics, limits, options), (q,), (changes,), has_aux=True)
 
     at, rates, (weight, owner) = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(7))
     columns, ends = _columns(phases, knots)
@@ -127,7 +141,7 @@ def linearise(p: Variables, tables: PathDynamics, limits: Limits, how: Integrato
     flat, unravel = ravel_pytree(p)
 
     def seams(x):
-        return _linkage_defects(unravel(x), tables)
+        return _linkage_defects(unravel(x), phase_dynamics)
 
     bears = np.arange(slack_sizes(knots)) < samples_of(knots - 1) * ROWS
     return LinearisedProblem(
@@ -142,7 +156,7 @@ def linearise(p: Variables, tables: PathDynamics, limits: Limits, how: Integrato
     )
 
 
-def _linkage_defects(p: Variables, tables: PathDynamics) -> Float[Array, "seams"]:
+def _linkage_defects(p: Variables, phase_dynamics: PathDynamics) -> Float[Array, "seams"]:
     """What must vanish where one phase takes over from another at speed: the error of the speed after the impact, and
     the torques' steps.
 
@@ -151,7 +165,7 @@ def _linkage_defects(p: Variables, tables: PathDynamics) -> Float[Array, "seams"
     """
     if p.torque.shape[0] == 1:
         return jnp.zeros(0)
-    before, after = (jax.tree.map(lambda a, k=k: a[k], tables) for k in (slice(0, -1), slice(1, None)))
+    before, after = (jax.tree.map(lambda a, k=k: a[k], phase_dynamics) for k in (slice(0, -1), slice(1, None)))
     speed = before.length / jnp.exp(p.log_duration[:-1]) * p.state[:-1, -1, 1]
     lost = p.state[1:, 0, 1] - impact_speed_ratio(before, after) * speed * jnp.exp(p.log_duration[1:]) / after.length
     return jnp.concatenate([lost, (p.torque[1:, 0] - p.torque[:-1, -1]).ravel()])
@@ -161,7 +175,7 @@ def impact_speed_ratio(before: PathDynamics, after: PathDynamics) -> Float[Array
     """`ds/dt` after the change of formation over that before it, tables stacked along the first axis."""
 
     def one(before, after):
-        panel, xi = locate_panel(before, before.count - 1, before.breaks[-1])
+        panel, xi = locate_panel(before, before.count - 1, before.breakpoints[-1])
         return resolve_impact(after, evaluate(before.velocity, panel, xi)).speed
 
     return jax.vmap(one)(before, after)
@@ -205,19 +219,25 @@ def scatter_add(linear: LinearisedProblem, values: Float[Array, "phases interval
     return jnp.where(linear.still, 0.0, jnp.zeros(linear.still.shape[0]).at[columns(linear)].add(values))
 
 
-def _by_interval(linear: LinearisedProblem, values: Float[Array, "phases parts *rest"]) -> Float[Array, "phases intervals *rest"]:
+def _by_interval(
+    linear: LinearisedProblem, values: Float[Array, "phases parts *rest"]
+) -> Float[Array, "phases intervals *rest"]:
     """Numbers of each part, summed for its interval."""
     phases, intervals = linear.at.end.shape[:2]
-    at = np.arange(phases)[:, None], linear.owner[:, intervals:]
+    at = np.arange(phases)[:, None], linear.interval_of_part[:, intervals:]
     return values[:, :intervals].at[at].add(values[:, intervals:])
 
 
-def jacobian_transpose_product(linear: LinearisedProblem, values: Float[Array, "phases parts rooms"]) -> Float[Array, "p"]:
+def jacobian_transpose_product(
+    linear: LinearisedProblem, values: Float[Array, "phases parts rooms"]
+) -> Float[Array, "p"]:
     """`J^T values`, with `J` the derivatives of all rooms."""
     return scatter_add(linear, _by_interval(linear, jnp.einsum("pkr,pkrq->pkq", values, linear.rates.room)))
 
 
-def gauss_newton_blocks(linear: LinearisedProblem, values: Float[Array, "phases parts rooms"]) -> Float[Array, "phases intervals 7 7"]:
+def gauss_newton_blocks(
+    linear: LinearisedProblem, values: Float[Array, "phases parts rooms"]
+) -> Float[Array, "phases intervals 7 7"]:
     """`J^T diag(values) J` for each interval's own seven variables."""
     rates = linear.rates.room
     return _by_interval(linear, jnp.einsum("pkr,pkrq,pkrs->pkqs", values, rates, rates))
@@ -225,5 +245,5 @@ def gauss_newton_blocks(linear: LinearisedProblem, values: Float[Array, "phases 
 
 def jacobian_product(linear: LinearisedProblem, way: Float[Array, "p"]) -> Float[Array, "phases parts rooms"]:
     """`J way`."""
-    own = jnp.take_along_axis(way[columns(linear)], linear.owner[..., None], axis=1)
+    own = jnp.take_along_axis(way[columns(linear)], linear.interval_of_part[..., None], axis=1)
     return jnp.einsum("pkrq,pkq->pkr", linear.rates.room, own)

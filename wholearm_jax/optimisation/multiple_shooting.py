@@ -7,7 +7,7 @@ linearly, even where the motion as a whole is unstable or starts after a long dw
 respect to seven numbers, whatever the number of knots.
 
 An interval is a small phase of its own: time is a share of the interval and `w` the speed in `s` per interval. Where it
-crosses from one piece of the wire to the next (`wire`), it is cut exactly there. States may pass rest and the wire's
+crosses from one piece of the wire to the next (`path`), it is cut exactly there. States may pass rest and the wire's
 end: the forces continue smoothly there, and only an honest simulation (`motion`) decides what happens.
 
 Source of the method: H. G. Bock and K. J. Plitt, A multiple shooting algorithm for direct solution of optimal control
@@ -28,12 +28,11 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.lookup import take_row
-from wholearm_jax.dynamics.path_dynamics import PathDynamics, differentiate_polynomial
-from wholearm_jax.margin.contact_forces import MAX_ROLLING, DenseOutput, quintic_hermite, cone_facets, sampled_slacks
-from wholearm_jax.model.schedule import PhaseSchedule
-from wholearm_jax.simulation.event_step import path_acceleration, solver_step
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.core import take_row
+from wholearm_jax.dynamics import PathDynamics, differentiate_polynomial
+from wholearm_jax.margin import MAX_ROLLING, DenseOutput, cone_facets, quintic_hermite, sampled_slacks
+from wholearm_jax.model import PhaseSchedule
+from wholearm_jax.simulation import IntegratorOptions, path_acceleration, solver_step
 
 ONE_STEP = 50  # intervals of a phase from which one solver step in each serves; fewer take two
 ROWS = 4 + MAX_ROLLING  # slacks a sample
@@ -65,9 +64,9 @@ def samples_of(intervals: int) -> int:
     return SPACES + steps_of(intervals)
 
 
-def extra_parts(table: PathDynamics) -> int:
+def extra_parts(dynamics: PathDynamics) -> int:
     """Room for the parts behind the first ones of all intervals of a phase together."""
-    return table.factor.shape[-1] + SPARE
+    return dynamics.speed_ratio.shape[-1] + SPARE
 
 
 class Samples(NamedTuple):
@@ -81,12 +80,12 @@ class Samples(NamedTuple):
 
 
 class IntervalResults(NamedTuple):
-    """Intervals simulated: all their parts, in which interval each lies (`owner`), and the states at the intervals'
+    """Intervals simulated: all their parts, in which interval each lies (`interval_of_part`), and the states at the intervals'
     ends as in `Variables`. Part `k` is the first one of interval `k`; behind the intervals' number is one for each
     piece of the wire that an interval comes into, and then those that come into a piece once more."""
 
     parts: Samples
-    owner: Int[Array, "parts"]
+    interval_of_part: Int[Array, "parts"]
     end: Float[Array, "intervals 2"]
 
 
@@ -99,111 +98,123 @@ def interval_inputs(p: Variables) -> Float[Array, "phases intervals 7"]:
 class _PartState(NamedTuple):
     """An interval on its way: where it has come to, and whether one part is behind it; each lies in one piece."""
 
-    share: Float[Array, "*intervals"]
+    phase_time: Float[Array, "*intervals"]
     y: Float[Array, "*intervals 2"]
-    piece: Int[Array, "*intervals"]
+    segment: Int[Array, "*intervals"]
     begun: Bool[Array, "*intervals"]
 
 
-def simulate_intervals(table: PathDynamics, how: IntegratorOptions, intervals: int, q: Float[Array, "cut 7"]) -> IntervalResults:
+def simulate_intervals(
+    dynamics: PathDynamics, options: IntegratorOptions, intervals: int, q: Float[Array, "cut 7"]
+) -> IntervalResults:
     """Simulate intervals of a phase, which as a whole has `intervals`.
 
     Where together they are cut more often than there is room for (`extra_parts`), or a cut is not found, they end in NaN.
     """
-    cut, room = q.shape[0], q.shape[0] + extra_parts(table)
-    pieces = table.factor.shape[-1]
-    begin = jax.vmap(lambda q: _interval_start(table, intervals, q))(q)
-    begun, firsts = jax.vmap(partial(_simulate_whole, table, how, intervals))(begin, q)
+    cut, room = q.shape[0], q.shape[0] + extra_parts(dynamics)
+    segments = dynamics.speed_ratio.shape[-1]
+    begin = jax.vmap(lambda q: _interval_start(dynamics, intervals, q))(q)
+    begun, firsts = jax.vmap(partial(_simulate_whole, dynamics, options, intervals))(begin, q)
     parts = jax.tree.map(lambda a: jnp.zeros((room, *a.shape[1:]), a.dtype).at[:cut].set(a), firsts)
     owner = jnp.minimum(jnp.arange(room), cut - 1)
 
     def going(state):
         at, *_, spare = state
-        return jnp.any(at.share < 1) & (spare < room)
+        return jnp.any(at.phase_time < 1) & (spare < room)
 
     def next_part(state):
         """Most intervals have one part: the others go one part at a time."""
         at, parts, owner, come, spare = state
-        k = jnp.argmax(at.share < 1)
+        k = jnp.argmax(at.phase_time < 1)
         one = jax.tree.map(lambda a: take_row(a, k), at)
-        after, samples = _simulate_to_kink(table, how, intervals, one, take_row(q, k))
-        again = take_row(come, one.piece)
-        row = jnp.where(one.begun, jnp.where(again, spare, cut + one.piece), k)
+        after, samples = _simulate_to_kink(dynamics, options, intervals, one, take_row(q, k))
+        again = take_row(come, one.segment)
+        row = jnp.where(one.begun, jnp.where(again, spare, cut + one.segment), k)
         at = jax.tree.map(lambda a, new: a.at[k].set(new), at, after)
         parts = jax.tree.map(lambda a, new: a.at[row].set(new), parts, samples)
-        come = come.at[one.piece].set(again | one.begun)
+        come = come.at[one.segment].set(again | one.begun)
         return at, parts, owner.at[row].set(k), come, spare + (one.begun & again)
 
-    start = begun, parts, owner, jnp.zeros(pieces, bool), jnp.asarray(cut + pieces)
+    start = begun, parts, owner, jnp.zeros(segments, bool), jnp.asarray(cut + segments)
     done, parts, owner, *_ = jax.lax.while_loop(going, next_part, start)
-    y = jnp.where((done.share < 1)[:, None], jnp.nan, done.y)
-    end = jnp.stack([y[:, 0] - table.breaks[0], y[:, 1] * intervals], axis=1) / table.length
+    y = jnp.where((done.phase_time < 1)[:, None], jnp.nan, done.y)
+    end = jnp.stack([y[:, 0] - dynamics.breakpoints[0], y[:, 1] * intervals], axis=1) / dynamics.length
     return IntervalResults(parts, owner, end)
 
 
-def _interval_start(table: PathDynamics, intervals: int, q: Float[Array, "7"]) -> _PartState:
+def _interval_start(dynamics: PathDynamics, intervals: int, q: Float[Array, "7"]) -> _PartState:
     """Where an interval begins."""
-    y = jnp.stack([table.breaks[0] + table.length * q[0], table.length / intervals * q[1]])
-    real = jnp.arange(table.breaks.shape[0]) < table.count
-    piece = jnp.maximum(((stop_gradient(y[0]) >= table.breaks) & real).sum() - 1, 0)
-    return _PartState(jnp.zeros(()), y, piece, jnp.asarray(False))
+    y = jnp.stack([dynamics.breakpoints[0] + dynamics.length * q[0], dynamics.length / intervals * q[1]])
+    real = jnp.arange(dynamics.breakpoints.shape[0]) < dynamics.count
+    segment = jnp.maximum(((stop_gradient(y[0]) >= dynamics.breakpoints) & real).sum() - 1, 0)
+    return _PartState(jnp.zeros(()), y, segment, jnp.asarray(False))
 
 
-def _simulate_whole(table: PathDynamics, how: IntegratorOptions, intervals: int, at: _PartState, q: Float[Array, "7"]) -> tuple[_PartState, Samples]:
+def _simulate_whole(
+    dynamics: PathDynamics, options: IntegratorOptions, intervals: int, at: _PartState, q: Float[Array, "7"]
+) -> tuple[_PartState, Samples]:
     """To the interval's end, within the piece that it begins in; one that comes past that piece's end does not set
     out."""
-    seen, duration = _schedule(table, intervals, q)
-    when, place = _steps(table, seen, duration, how, at, 1.0, steps_of(intervals))
-    past = place[-1, 0] > _goal(table, at.piece)
-    ended = _PartState(jnp.ones_like(at.share), place[-1], at.piece, jnp.asarray(True))
+    phase_schedule, duration = _schedule(dynamics, intervals, q)
+    when, place = _steps(dynamics, phase_schedule, duration, options, at, 1.0, steps_of(intervals))
+    past = place[-1, 0] > _goal(dynamics, at.segment)
+    ended = _PartState(jnp.ones_like(at.phase_time), place[-1], at.segment, jnp.asarray(True))
     after = jax.tree.map(lambda stay, go: jnp.where(past, stay, go), at, ended)
-    return after, _sampled(table, seen, duration, intervals, when, place, at.piece)
+    return after, _sampled(dynamics, phase_schedule, duration, intervals, when, place, at.segment)
 
 
-def _simulate_to_kink(table: PathDynamics, how: IntegratorOptions, intervals: int, at: _PartState, q: Float[Array, "7"]) -> tuple[_PartState, Samples]:
+def _simulate_to_kink(
+    dynamics: PathDynamics, options: IntegratorOptions, intervals: int, at: _PartState, q: Float[Array, "7"]
+) -> tuple[_PartState, Samples]:
     """To the interval's end, or the end of the piece."""
-    seen, duration = _schedule(table, intervals, q)
-    when, place, onward = _to_break(table, seen, duration, how, at, steps_of(intervals))
-    factor = table.factor[jnp.minimum(at.piece + 1, table.factor.shape[0] - 1)]
+    phase_schedule, duration = _schedule(dynamics, intervals, q)
+    when, place, onward = _to_break(dynamics, phase_schedule, duration, options, at, steps_of(intervals))
+    factor = dynamics.speed_ratio[jnp.minimum(at.segment + 1, dynamics.speed_ratio.shape[0] - 1)]
     after = _PartState(
-        share=jnp.where(onward, when[-1], 1.0),
+        phase_time=jnp.where(onward, when[-1], 1.0),
         y=place[-1] * jnp.where(onward, jnp.stack([jnp.ones_like(factor), factor]), 1.0),
-        piece=at.piece + onward,
+        segment=at.segment + onward,
         begun=jnp.asarray(True),
     )
-    return after, _sampled(table, seen, duration, intervals, when, place, at.piece)
+    return after, _sampled(dynamics, phase_schedule, duration, intervals, when, place, at.segment)
 
 
-def _schedule(table: PathDynamics, intervals: int, q: Float[Array, "7"]) -> tuple[PhaseSchedule, Float[Array, ""]]:
+def _schedule(dynamics: PathDynamics, intervals: int, q: Float[Array, "7"]) -> tuple[PhaseSchedule, Float[Array, ""]]:
     """An interval's torques, and how long it lasts."""
-    values, zero = q[2:6].reshape(2, 2) * table.torque_limit, jnp.zeros((), int)
+    values, zero = q[2:6].reshape(2, 2) * dynamics.torque_limit, jnp.zeros((), int)
     return PhaseSchedule(jnp.arange(2.0), values, values[1:] - values[:-1], zero, zero), jnp.exp(q[6]) / intervals
 
 
-def _goal(table: PathDynamics, piece) -> Float[Array, ""]:
+def _goal(dynamics: PathDynamics, segment) -> Float[Array, ""]:
     """Where a piece ends for intervals: the last one nowhere."""
-    return jnp.where(piece >= table.count - 1, jnp.inf, table.breaks[piece + 1])
+    return jnp.where(segment >= dynamics.count - 1, jnp.inf, dynamics.breakpoints[segment + 1])
 
 
-def _sampled(table: PathDynamics, seen: PhaseSchedule, duration, intervals: int, when, place, piece) -> Samples:
+def _sampled(
+    dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, intervals: int, when, place, segment
+) -> Samples:
     """Forces and speeds of a part."""
     count, samples = steps_of(intervals), samples_of(intervals)
-    steps = _arcs(table, seen, duration, when, place, piece)
-    forces = sampled_slacks(table, seen, duration, steps, samples // count, cone_facets).reshape(samples, -1)
+    steps = _arcs(dynamics, phase_schedule, duration, when, place, segment)
+    forces = sampled_slacks(dynamics, phase_schedule, duration, steps, samples // count, cone_facets).reshape(
+        samples, -1
+    )
     span = stop_gradient(when[-1] - when[0]) / intervals
     weight, pace_weight = (jnp.full(each, span / each) for each in (samples, SPEED_COEFFICIENTS))
     forces = jnp.where(span > 0, forces, 0.0)
-    return Samples(forces, weight, _speed_lower_bounds(steps) / (table.length / intervals), pace_weight)
+    return Samples(forces, weight, _speed_lower_bounds(steps) / (dynamics.length / intervals), pace_weight)
 
 
-def _arcs(table: PathDynamics, seen: PhaseSchedule, duration, when, place, piece) -> DenseOutput:
+def _arcs(dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, when, place, segment) -> DenseOutput:
     """A part's steps."""
-    share, s, w = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (when, place[:, 0], place[:, 1]))
-    count = share.shape[0]
-    pieces, row = jnp.broadcast_to(piece, count), jnp.zeros(count, int)
-    live = share[:, 1] > share[:, 0]
-    quintic = jax.vmap(quintic_hermite, (None, None, None, 0, 0, 0, 0, 0, 0))(table, seen, duration, share, s, w, pieces, row, live)
-    return DenseOutput(share, quintic, pieces, row, jnp.zeros(count, bool), live)
+    phase_time, s, w = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (when, place[:, 0], place[:, 1]))
+    count = phase_time.shape[0]
+    segments, row = jnp.broadcast_to(segment, count), jnp.zeros(count, int)
+    live = phase_time[:, 1] > phase_time[:, 0]
+    quintic = jax.vmap(quintic_hermite, (None, None, None, 0, 0, 0, 0, 0, 0))(
+        dynamics, phase_schedule, duration, phase_time, s, w, segments, row, live
+    )
+    return DenseOutput(phase_time, quintic, segments, row, jnp.zeros(count, bool), live)
 
 
 def _speed_lower_bounds(steps: DenseOutput) -> Float[Array, "paces"]:
@@ -213,7 +224,7 @@ def _speed_lower_bounds(steps: DenseOutput) -> Float[Array, "paces"]:
     half begins, the last that where the next one does. Speeds at some places alone would let it fall below zero between
     them, where an honest simulation stops.
     """
-    width = steps.share[:, 1] - steps.share[:, 0]
+    width = steps.phase_time[:, 1] - steps.phase_time[:, 0]
     slopes = jax.vmap(differentiate_polynomial)(steps.quintic) @ _bernstein(SPEED_COEFFICIENTS // HALF // width.size).T
     return jnp.where(steps.live[:, None], slopes / jnp.where(steps.live, width, 1.0)[:, None], 1.0).ravel()
 
@@ -229,34 +240,42 @@ def _bernstein(parts: int) -> Float[np.ndarray, "coefficients 5"]:
     return np.concatenate([basis @ np.array(one) for one in shift])
 
 
-def _steps(table: PathDynamics, seen: PhaseSchedule, duration, how: IntegratorOptions, at: _PartState, length, count: int):
+def _steps(
+    dynamics: PathDynamics,
+    phase_schedule: PhaseSchedule,
+    duration,
+    options: IntegratorOptions,
+    at: _PartState,
+    length,
+    count: int,
+):
     """Shares and states along `count` steps that together have a length."""
     row = jnp.zeros((), int)
 
     def once(state, _):
-        share, y = state
-        y = solver_step(table, seen, duration, how, at.piece, row, share, y, length / count)
-        share = share + length / count
-        return (share, y), (share, y)
+        phase_time, y = state
+        y = solver_step(dynamics, phase_schedule, duration, options, at.segment, row, phase_time, y, length / count)
+        phase_time = phase_time + length / count
+        return (phase_time, y), (phase_time, y)
 
-    _, (when, place) = jax.lax.scan(once, (at.share, at.y), None, length=count)
-    return jnp.concatenate([at.share[None], when]), jnp.concatenate([at.y[None], place])
+    _, (when, place) = jax.lax.scan(once, (at.phase_time, at.y), None, length=count)
+    return jnp.concatenate([at.phase_time[None], when]), jnp.concatenate([at.y[None], place])
 
 
-def _to_break(table, seen, duration, how, at: _PartState, count: int):
+def _to_break(dynamics, phase_schedule, duration, options, at: _PartState, count: int):
     """`count` steps from where an interval has come to its end or the end of the piece, whichever is first.
 
     Returns the shares and states of the steps' ends, and whether the piece ended.
     """
-    goal = _goal(table, at.piece)
-    frozen = stop_gradient((table, seen, duration))
+    goal = _goal(dynamics, at.segment)
+    frozen = stop_gradient((dynamics, phase_schedule, duration))
     still = stop_gradient(at)
-    whole = 1 - still.share
+    whole = 1 - still.phase_time
 
     def narrow(bracket):
         """Newton on the part's length, bisecting where it would leave the bracket."""
         low, high, length, _, number = bracket
-        _, place = _steps(*frozen, how, still, length, count)
+        _, place = _steps(*frozen, options, still, length, count)
         miss = place[-1, 0] - goal
         low, high = jnp.where(miss < 0, length, low), jnp.where(miss < 0, high, length)
         guess = length - miss / jnp.where(place[-1, 1] == 0, 1.0, place[-1, 1])
@@ -268,11 +287,15 @@ def _to_break(table, seen, duration, how, at: _PartState, count: int):
     start = (0 * whole, whole, whole, ~(whole > 0), 0)
     _, _, length, settled, _ = jax.lax.while_loop(lambda b: ~b[3] & (b[4] < MAX_KINK_ITERATIONS), narrow, start)
     onward = length < whole
-    when, place = _steps(table, seen, duration, how, at, jnp.where(onward, length, 1 - at.share), count)
+    when, place = _steps(
+        dynamics, phase_schedule, duration, options, at, jnp.where(onward, length, 1 - at.phase_time), count
+    )
 
-    def rate(share, y):
+    def rate(phase_time, y):
         row = jnp.zeros((), int)
-        return jnp.stack([y[1], path_acceleration(table, seen, duration, at.piece, row, share, y[0], y[1])])
+        return jnp.stack(
+            [y[1], path_acceleration(dynamics, phase_schedule, duration, at.segment, row, phase_time, y[0], y[1])]
+        )
 
     # The cut lies where the end is exactly the goal: a shift of rounding size that carries the cut's derivatives.
     pace = jnp.where(onward, stop_gradient(place[-1, 1]), 1.0)

@@ -19,14 +19,27 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.core.arrays import as_device_array
-from wholearm_jax.core.programs import BackgroundCall, Program, call_in_background, wait_for
-from wholearm_jax.core.status import Status
-from wholearm_jax.core.validation import require_positive, require_x64
-from wholearm_jax.dynamics.path_dynamics import placeholder_dynamics
-from wholearm_jax.margin.quasistatic import MarginBound, margin_upper_bound
-from wholearm_jax.model.scene import Phase, Scene, replace_duration
-from wholearm_jax.model.schedule import TorqueSchedule, uniform_schedule, concatenate_schedules, round_up
+from wholearm_jax.core import (
+    BackgroundCall,
+    Program,
+    Status,
+    as_device_array,
+    call_in_background,
+    require_positive,
+    require_x64,
+    wait_for,
+)
+from wholearm_jax.dynamics import placeholder_dynamics
+from wholearm_jax.margin import MarginBound, margin_upper_bound
+from wholearm_jax.model import (
+    Phase,
+    Scene,
+    TorqueSchedule,
+    concatenate_schedules,
+    replace_duration,
+    round_up,
+    uniform_schedule,
+)
 from wholearm_jax.optimisation.coupled_phases import (
     SHORTEST,
     TORQUE_SHARE,
@@ -40,13 +53,19 @@ from wholearm_jax.optimisation.initial_guess import initial_guesses
 from wholearm_jax.optimisation.interior_point import init_solver, take_step
 from wholearm_jax.optimisation.linearisation import Limits
 from wholearm_jax.optimisation.multiple_shooting import Variables, extra_parts
-from wholearm_jax.optimisation.rest_transition import RestTransition, rest_transitions, holding_schedule
+from wholearm_jax.optimisation.rest_transition import RestTransition, holding_schedule, rest_transitions
 from wholearm_jax.optimisation.solver import INTERVAL_OPTIONS, IterationRecord
-from wholearm_jax.phases.phase import TracedPhase, statics_at_start, precompile_simulation
-from wholearm_jax.phases.plan import simulate_phases, trace
-from wholearm_jax.phases.result import Result, build_result
-from wholearm_jax.simulation.integrator import IntegratorOptions, with_step_capacity
-from wholearm_jax.tracing.path import Resolution
+from wholearm_jax.phases import (
+    Result,
+    TracedPhase,
+    build_result,
+    precompile_simulation,
+    simulate_phases,
+    statics_at_start,
+    trace,
+)
+from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
+from wholearm_jax.tracing import Resolution
 
 MAX_DWELLS = (0.25, 0.1)  # shares of a phase for which its object may wait before it sets out, where rates are limited
 MIN_TRANSITION_SPEED = 0.2  # least speed with which a phase is entered that does not begin at rest, over its mean speed
@@ -67,7 +86,7 @@ class OptimisationResult:
     history: tuple[IterationRecord, ...]
 
     @property
-    def reached(self) -> tuple[float, ...]:
+    def bound_fraction(self) -> tuple[float, ...]:
         """The share of its bound that each phase reached; NaN where the bound is not positive."""
         pairs = zip(self.result.phases, self.bounds, strict=True)
         return tuple(p.margin / float(b.value) if float(b.value) > 0 else float("nan") for p, b in pairs)
@@ -91,8 +110,8 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[TracedPhase, ...
     def torques(at, phase):
         if phase.arrive == "hold":
             return holding_schedule(scene, phase, at, knots)
-        start = initial_guesses([at.table], [float(phase.duration)], knots, 1.0)[0]
-        return uniform_schedule(float(phase.duration), at.table.torque_limit * start.torque[0])
+        start = initial_guesses([at.dynamics], [float(phase.duration)], knots, 1.0)[0]
+        return uniform_schedule(float(phase.duration), at.dynamics.torque_limit * start.torque[0])
 
     return concatenate_schedules([torques(*pair) for pair in zip(traced, scene.phases, strict=True)])
 
@@ -112,13 +131,13 @@ def bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[Margi
     rows = zip(traced, scene.phases, begins, strict=True)
 
     def top(at, phase, begin):
-        if int(at.table.status) != Status.OK:
-            return MarginBound(jnp.asarray(-np.inf), at.table.breaks[0], jnp.zeros(()))
+        if int(at.dynamics.status) != Status.OK:
+            return MarginBound(jnp.asarray(-np.inf), at.dynamics.breakpoints[0], jnp.zeros(()))
         if phase.arrive != "hold":
             told = as_device_array(begin), as_device_array(phase.arrive == "rest"), _rolling(phase)
-            return _bound(at.table, phase.duration, *told)
+            return _bound(at.dynamics, phase.duration, *told)
         balance, departure = statics_at_start(scene, phase, at)
-        return MarginBound(jnp.asarray(balance.best(departure).margin), at.table.breaks[0], jnp.zeros(()))
+        return MarginBound(jnp.asarray(balance.best(departure).margin), at.dynamics.breakpoints[0], jnp.zeros(()))
 
     return tuple(top(*row) for row in rows)
 
@@ -168,7 +187,7 @@ def optimise(
         scene, durations = _lasting(scene, durations[0]), None
     compiled = precompile_optimise(scene, knots=knots, optimiser=optimiser)
     traced = traced or trace(scene)
-    if any(int(at.table.status) == Status.OK for at in traced):
+    if any(int(at.dynamics.status) == Status.OK for at in traced):
         wait_for(*compiled)
     # A bound covers speeds as multiples of a length a duration: of the shortest that a phase may choose.
     least = scene if durations is None else _lasting(scene, max(durations[0], SHORTEST * durations[1]))
@@ -206,20 +225,30 @@ def _attempt(scene: Scene, traced, tops, wanted: OptimiseOptions, lead: float) -
     phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, lengths, strict=True))
     scene = eqx.tree_at(lambda s: s.phases, scene, phases)
     torque = concatenate_schedules(found)
-    result = build_result(scene, torque, traced, simulate_phases(scene, torque, traced, with_step_capacity(IntegratorOptions(), wanted.knots)))
+    result = build_result(
+        scene,
+        torque,
+        traced,
+        simulate_phases(scene, torque, traced, with_step_capacity(IntegratorOptions(), wanted.knots)),
+    )
     return OptimisationResult(scene, torque, result, tops, tuple(stopped), tuple(history))
 
 
 def _part(
-    scene: Scene, traced, tops, wanted: OptimiseOptions, group: list[int], ends: tuple[RestTransition | None, RestTransition | None]
+    scene: Scene,
+    traced,
+    tops,
+    wanted: OptimiseOptions,
+    group: list[int],
+    ends: tuple[RestTransition | None, RestTransition | None],
 ) -> tuple[list[TorqueSchedule], str, list[IterationRecord]]:
     """One group of phases, given how it takes over and hands over: schedules, why their descent stopped, its steps."""
     phases, (begin, end) = tuple(scene.phases[k] for k in group), ends
     if phases[0].arrive == "hold":
         held = holding_schedule(scene, phases[0], traced[group[0]], wanted.knots, wanted.rate_limit, begin, end)
         return [held], "the best torque of a linear programme", []
-    wires, most = [traced[k] for k in group], [tops[k] for k in group]
-    return solve_coupled_phases(scene, CoupledPhases(group[0], phases, wires, most, begin, end, wanted))
+    paths, most = [traced[k] for k in group], [tops[k] for k in group]
+    return solve_coupled_phases(scene, CoupledPhases(group[0], phases, paths, most, begin, end, wanted))
 
 
 def _in_turn_called(callback: Callable[[IterationRecord], None]) -> Callable[[IterationRecord], None]:
@@ -247,7 +276,11 @@ def precompile_optimise(
     rolling = sorted({_rolling(p) for p in scene.phases if p.arrive != "hold"})
     squeezes = call_in_background(_squeeze_blank, tuple(sizes), tuple(rolling), knots)
     descents = [call_in_background(_advance_blank, n, knots, optimiser) for n in sizes]
-    return squeezes, *descents, call_in_background(precompile_simulation, _rows(scene, knots), with_step_capacity(IntegratorOptions(), knots))
+    return (
+        squeezes,
+        *descents,
+        call_in_background(precompile_simulation, _rows(scene, knots), with_step_capacity(IntegratorOptions(), knots)),
+    )
 
 
 def _rows(scene: Scene, knots: int) -> int:
@@ -271,23 +304,23 @@ def _rolling(phase: Phase) -> int:
 
 def _squeeze_blank(sizes: tuple[int, ...], rolling: tuple[int, ...], knots: int) -> None:
     """Make the bounds and starts of groups of such sizes on tables that have no wire."""
-    table, one = placeholder_dynamics(Resolution()), as_device_array(1.0)
+    dynamics, one = placeholder_dynamics(Resolution()), as_device_array(1.0)
     for count in rolling:
-        _bound(table, one, as_device_array(True), as_device_array(True), count)
+        _bound(dynamics, one, as_device_array(True), as_device_array(True), count)
     for phases in sizes:
-        initial_guesses([table] * phases, np.ones(phases), knots, TORQUE_SHARE)
+        initial_guesses([dynamics] * phases, np.ones(phases), knots, TORQUE_SHARE)
 
 
 def _advance_blank(phases: int, knots: int, optimiser: optax.GradientTransformation | None) -> None:
     """Take one step of a descent on tables that have no wire."""
-    tables = stacked_tables([placeholder_dynamics(Resolution())] * phases)
-    method = descent_method(optimiser, phases, extra_parts(tables))
+    phase_dynamics = stacked_tables([placeholder_dynamics(Resolution())] * phases)
+    method = descent_method(optimiser, phases, extra_parts(phase_dynamics))
     each = np.ones(phases)
     plain = (np.full(2, np.inf), each, each, np.zeros(()), np.zeros((phases, knots), bool), each)
     limits = Limits(*(as_device_array(a) for a in plain))
     empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
     p = Variables(*(as_device_array(a) for a in empty))
-    take_step(init_solver(p, method), tables, limits, INTERVAL_OPTIONS, method)
+    take_step(init_solver(p, method), phase_dynamics, limits, INTERVAL_OPTIONS, method)
 
 
 _bound = Program(margin_upper_bound)

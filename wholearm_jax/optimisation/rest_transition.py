@@ -22,19 +22,26 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core.arrays import as_device_array
-from wholearm_jax.core.programs import Program
-from wholearm_jax.core.status import Status
-from wholearm_jax.dynamics.path_dynamics import PathDynamics
-from wholearm_jax.margin.contact_forces import cone_facets
-from wholearm_jax.margin.quasistatic import MarginBound, affine_coefficients
-from wholearm_jax.margin.statics import MARGIN_TIE, SOLVER_TOL, RestAccelerations, Statics
-from wholearm_jax.model.scene import Phase, Scene
-from wholearm_jax.model.schedule import TorqueSchedule, uniform_schedule
-from wholearm_jax.phases.phase import TracedPhase, statics_at_start
+from wholearm_jax.core import Program, Status, as_device_array
+from wholearm_jax.dynamics import PathDynamics
+from wholearm_jax.margin import (
+    MARGIN_TIE,
+    SOLVER_TOL,
+    MarginBound,
+    RestAccelerations,
+    Statics,
+    affine_coefficients,
+    cone_facets,
+)
+from wholearm_jax.model import Phase, Scene, TorqueSchedule, uniform_schedule
+from wholearm_jax.phases import TracedPhase, statics_at_start
 
-MIN_ACCELERATION = 1.0  # least acceleration with which an object arrives, or sets out at once [wire lengths a duration squared]
-MIN_SPEED_CHANGE = 2.0  # change of speed within which the largest such acceleration is reached [wire lengths a duration]
+MIN_ACCELERATION = (
+    1.0  # least acceleration with which an object arrives, or sets out at once [wire lengths a duration squared]
+)
+MIN_SPEED_CHANGE = (
+    2.0  # change of speed within which the largest such acceleration is reached [wire lengths a duration]
+)
 MIN_REST_MARGIN = 0.01  # how far from the torques that would move it an object rests, as a share of their limits
 TAU, SIGMA, WAY, LEVEL, KNOWN = slice(0, 2), slice(2, 4), 4, 5, 6  # a programme's variables: the torques in units of
 # their limits, the larger of the ways from one to the other, m, and then the forces of statics
@@ -43,7 +50,7 @@ TAU, SIGMA, WAY, LEVEL, KNOWN = slice(0, 2), slice(2, 4), 4, 5, 6  # a programme
 class Moving(NamedTuple):
     """A phase that moves its object: its table, duration [s], and the bound of its margin [N]."""
 
-    table: PathDynamics
+    dynamics: PathDynamics
     duration: float
     bound: float
 
@@ -64,18 +71,18 @@ class ReachableTorque(NamedTuple):
 
 
 class RestTransition(NamedTuple):
-    """The `torque` [N m] at a change and the one with which the object sets out (`begin`), `lead` [s] later; `share`
+    """The `torque` [N m] at a change and the one with which the object sets out (`begin`), `lead` [s] later; `margin_fraction`
     is the least margin at both over its bound, `-inf` where no torques can serve."""
 
     torque: Float[np.ndarray, "2"]
     begin: Float[np.ndarray, "2"]
     lead: float
-    share: float
+    margin_fraction: float
 
     @property
     def serves(self) -> bool:
         """Whether there are such torques."""
-        return self.share > 0
+        return self.margin_fraction > 0
 
 
 def rest_transitions(
@@ -99,7 +106,7 @@ def rest_transitions(
         return float(np.clip(length, *durations)) if durations is not None and moves else length
 
     def moving(k):
-        return Moving(traced[k].table, lasts(k), float(tops[k].value))
+        return Moving(traced[k].dynamics, lasts(k), float(tops[k].value))
 
     def resting(k):
         return Resting(*statics_at_start(scene, scene.phases[k], traced[k]), float(tops[k].value))
@@ -112,7 +119,7 @@ def rest_transitions(
 
     def between(group, following, begin):
         k, onward = group[-1], following[0]
-        if any(int(traced[n].table.status) != Status.OK or not float(tops[n].value) > 0 for n in (k, onward)):
+        if any(int(traced[n].dynamics.status) != Status.OK or not float(tops[n].value) > 0 for n in (k, onward)):
             return None
         before = resting(k) if scene.phases[k].arrive == "hold" else moving(k)
         after = None if scene.phases[onward].arrive == "hold" else moving(onward)
@@ -138,7 +145,7 @@ def holding_schedule(
 
     The margin is concave in the torque, so that it is nowhere on either way less than at both its ends.
     """
-    duration, known = float(phase.duration), int(at.table.status) == Status.OK
+    duration, known = float(phase.duration), int(at.dynamics.status) == Status.OK
     if not known:
         return uniform_schedule(duration, np.zeros((knots, 2)))
     balance, departure = statics_at_start(scene, phase, at)
@@ -163,7 +170,9 @@ def holding_schedule(
     via, there, back = by(share)
     times = np.array([0.0, min(there, duration), max(duration - back, there), duration])
     last_of_each = np.append(np.diff(times) > 0, True)
-    return TorqueSchedule(as_device_array(times[last_of_each]), as_device_array(np.stack([first, via, via, last])[last_of_each]))
+    return TorqueSchedule(
+        as_device_array(times[last_of_each]), as_device_array(np.stack([first, via, via, last])[last_of_each])
+    )
 
 
 def rest_transition(
@@ -189,7 +198,7 @@ def rest_transition(
     now, soon = _setting_out(onward, limit, rate_limit)
     at_once = _solved([*common, *now], limit, rate_limit, 0.0)
     later = _solved([*common, _staying(after), *soon], limit, rate_limit, lead * onward.duration)
-    return at_once if at_once.share >= MARGIN_TIE * later.share else later
+    return at_once if at_once.margin_fraction >= MARGIN_TIE * later.margin_fraction else later
 
 
 class _Conditions(NamedTuple):
@@ -214,7 +223,7 @@ def _nothing():
 
 
 def _arriving(phase: Moving, limit, rate_limit: float) -> list[_Conditions]:
-    motion, forces = _terms_at(phase.table, -1)
+    motion, forces = _terms_at(phase.dynamics, -1)
     return [
         _bearing(forces / phase.bound, limit),
         _accelerating(-motion, limit, TAU, *_range(phase, motion, rate_limit)),
@@ -223,7 +232,7 @@ def _arriving(phase: Moving, limit, rate_limit: float) -> list[_Conditions]:
 
 def _setting_out(phase: Moving, limit, rate_limit: float) -> tuple[list[_Conditions], list[_Conditions]]:
     """At `tau` itself, and at `sigma`."""
-    motion, forces = _terms_at(phase.table, 0)
+    motion, forces = _terms_at(phase.dynamics, 0)
     forces = forces / phase.bound
     at_once = [_bearing(forces, limit), _accelerating(motion, limit, TAU, *_range(phase, motion, rate_limit))]
     return at_once, [_bearing(forces, limit, SIGMA), _accelerating(motion, limit, SIGMA, 0.0, 0.0)]
@@ -232,7 +241,7 @@ def _setting_out(phase: Moving, limit, rate_limit: float) -> tuple[list[_Conditi
 def _range(phase: Moving, motion, rate_limit: float) -> tuple[float, float]:
     """Accelerations with which an object may arrive or set out: the largest is reached at the limited rate while the
     object's speed changes by `MIN_SPEED_CHANGE`."""
-    length, pull = float(phase.table.length), float(np.abs(motion[3:]).sum())
+    length, pull = float(phase.dynamics.length), float(np.abs(motion[3:]).sum())
     least = MIN_ACCELERATION * length / phase.duration**2
     return least, max(2 * least, float(np.sqrt(2 * MIN_SPEED_CHANGE * length / phase.duration * pull * rate_limit)))
 
@@ -317,12 +326,12 @@ def _solved(conditions: list[_Conditions], limit, rate_limit: float, longest: fl
     return RestTransition(tau, sigma if longest > 0 else tau, lead, float(x[LEVEL]))
 
 
-def _terms_at(table: PathDynamics, end: int):
-    return jax.device_get(_terms(table, table.breaks[end]))
+def _terms_at(dynamics: PathDynamics, end: int):
+    return jax.device_get(_terms(dynamics, dynamics.breakpoints[end]))
 
 
 @Program
-def _terms(table: PathDynamics, s) -> tuple[Float[Array, "5"], Float[Array, "slacks 5"]]:
+def _terms(dynamics: PathDynamics, s) -> tuple[Float[Array, "5"], Float[Array, "slacks 5"]]:
     """Coefficients of the acceleration and of the slacks at a place of a wire."""
-    motion, forces = affine_coefficients(table, s)
-    return motion, cone_facets(table, forces)
+    motion, forces = affine_coefficients(dynamics, s)
+    return motion, cone_facets(dynamics, forces)

@@ -21,8 +21,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core.small_linalg import fused_matmul
-from wholearm_jax.optimisation.linearisation import LinearisedProblem, gauss_newton_blocks, columns, jacobian_transpose_product, of_states, sizes
+from wholearm_jax.core import fused_matmul
+from wholearm_jax.optimisation.linearisation import (
+    LinearisedProblem,
+    columns,
+    gauss_newton_blocks,
+    jacobian_transpose_product,
+    of_states,
+    sizes,
+)
 
 SPREAD = 1e-8  # price of the square of any change: what no room depends on stays where it is
 
@@ -90,7 +97,9 @@ class _LQStages(NamedTuple):
     ends: Float[Array, "phases intervals 2 numbers"]
 
 
-def kkt_step(linear: LinearisedProblem, stiff, aim, damping) -> tuple[Float[Array, "p"], Float[Array, ""], Float[Array, "e"]]:
+def kkt_step(
+    linear: LinearisedProblem, stiff, aim, damping
+) -> tuple[Float[Array, "p"], Float[Array, ""], Float[Array, "e"]]:
     """The steps of `p` and of the margin's level `m`, and the prices `y` of the equations that `p` must keep:
 
         (J^T S J + damping) p - J^T S b m + E^T y = J^T aim
@@ -116,7 +125,9 @@ def project_step(linear: LinearisedProblem, wanted: Float[Array, "p"]) -> Float[
     return solve_lq(linear, ParametricLQ(none, price, wanted, jnp.zeros_like(wanted), zero + 1, zero))[0]
 
 
-def solve_lq(linear: LinearisedProblem, quadratic: ParametricLQ) -> tuple[Float[Array, "p"], Float[Array, ""], Float[Array, "e"]]:
+def solve_lq(
+    linear: LinearisedProblem, quadratic: ParametricLQ
+) -> tuple[Float[Array, "p"], Float[Array, ""], Float[Array, "e"]]:
     """Where a quadratic function is least under `E p = -defect`: `p`, the level, and the prices of the equations."""
     at, stages = _stage_layout(*sizes(linear)), _stages(linear, quadratic)
     value, gain, rate = _backward_pass(at, stages, quadratic)
@@ -143,7 +154,9 @@ def _backward_pass(at: _StageLayout, stages: _LQStages, quadratic: ParametricLQ)
     def back(value, stage):
         cost, onward = stage
         onward = jnp.concatenate([onward, kept])
-        whole = fused_matmul(onward.T, fused_matmul(value, onward)) + cost  # sums of products: the loop is compiled whole
+        whole = (
+            fused_matmul(onward.T, fused_matmul(value, onward)) + cost
+        )  # sums of products: the loop is compiled whole
         (a, b), (_, c) = whole[size:, size:]
         first, second = whole[size:, :size]
         gain = jnp.stack([c * first - b * second, a * second - b * first]) / (a * c - b * b)

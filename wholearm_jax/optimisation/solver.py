@@ -14,11 +14,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from wholearm_jax.dynamics.path_dynamics import PathDynamics
+from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.optimisation.interior_point import DEFECT_TOL, init_solver, take_step
 from wholearm_jax.optimisation.linearisation import Limits
 from wholearm_jax.optimisation.multiple_shooting import Variables
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation import IntegratorOptions
 
 RISE = 0.01  # most that a step which is held back may raise the merit, as a share of the bound
 DAMPING, DAMPED = 1e-8, 1.3  # price of its size, and by how much that grows from one such step to the next
@@ -26,7 +26,10 @@ CLOSE = 1e-5  # sum of the defects from which full steps close them
 SETTLED, NEARLY = 0.05, 1e-2  # shares of the tolerance by which a margin that settled changes, sum of its defects
 CLOSING = 1e3  # price of a step's size beside which the margin counts little: the smallest step that joins intervals
 LOST = 1e-6  # share of a step at which a descent gives up
-SAME_SOLUTION_TOL = (2e-3, 2e-2)  # differences of states at knots [lengths, lengths a duration] with which descents end alike
+SAME_SOLUTION_TOL = (
+    2e-3,
+    2e-2,
+)  # differences of states at knots [lengths, lengths a duration] with which descents end alike
 CONVERGED, REPEATED = "the margin no longer improves", "an earlier start led there, too"
 INTERVAL_OPTIONS = IntegratorOptions()
 
@@ -50,7 +53,7 @@ class Problem(NamedTuple):
     number; at most `steps` steps, and a `tolerance` as a share of the bound."""
 
     phase: int
-    tables: PathDynamics
+    phase_dynamics: PathDynamics
     bounds: np.ndarray
     limits: Limits
     steps: int
@@ -73,9 +76,16 @@ def solve(
     d, rounds, margin_before, history = init_solver(start, method), 0, np.nan, []
     for count in range(problem.steps):
         begun = time.perf_counter()
-        after = take_step(d, problem.tables, problem.limits, INTERVAL_OPTIONS, method)
+        after = take_step(d, problem.phase_dynamics, problem.limits, INTERVAL_OPTIONS, method)
         least, apart, hot, coldest, shares, share = jax.device_get(
-            (after.least, after.apart, after.state.temperature, after.state.coldest, after.state.steps, after.share)
+            (
+                after.least,
+                after.apart,
+                after.state.temperature,
+                after.state.coldest,
+                after.state.steps,
+                after.step_fraction,
+            )
         )
         margin, near = float((least * problem.bounds).min()), least.min() >= 1 - problem.tolerance
         spent = time.perf_counter() - begun

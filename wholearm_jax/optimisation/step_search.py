@@ -17,16 +17,19 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from wholearm_jax.core.programs import BackgroundCall, call_in_background, wait_for
-from wholearm_jax.core.status import Status
-from wholearm_jax.core.validation import require_x64
-from wholearm_jax.margin.quasistatic import affine_coefficients, best_quasistatic_torque
-from wholearm_jax.model.scene import Phase, Scene, replace_duration
-from wholearm_jax.model.schedule import TorqueSchedule, pad_schedule, round_up
-from wholearm_jax.phases.phase import TracedPhase, simulate_phase, precompile_simulation
-from wholearm_jax.phases.plan import require_motion, simulate, trace
-from wholearm_jax.phases.result import Result
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.core import BackgroundCall, Status, call_in_background, require_x64, wait_for
+from wholearm_jax.margin import affine_coefficients, best_quasistatic_torque
+from wholearm_jax.model import Phase, Scene, TorqueSchedule, pad_schedule, replace_duration, round_up
+from wholearm_jax.phases import (
+    Result,
+    TracedPhase,
+    precompile_simulation,
+    require_motion,
+    simulate,
+    simulate_phase,
+    trace,
+)
+from wholearm_jax.simulation import IntegratorOptions
 
 STEP = 1.1
 HOLDS = tuple(STEP**-k for k in range(26, 0, -1))  # shares of the torque limits within which a series may begin
@@ -52,7 +55,7 @@ def search_by_steps(scene: Scene, *, longest: float = 10.0, traced: tuple[Traced
 
     The paper's section 3.1 (derivation, section 10). Raises RuntimeError without float64.
 
-    >>> found = wa.search(wa.load("hexagon"))
+    >>> found = wa.search_by_steps(wa.load("hexagon"))
     >>> found.result.status.label, found.torque.values.shape
     ('ok', (4, 2))
     """
@@ -83,36 +86,36 @@ def precompile_search() -> BackgroundCall:
 
 
 def _arriving(phase: Phase) -> Phase:
-    return Phase(phase.name, phase.formation, phase.heading, phase.duration, arrive="caught")
+    return Phase(phase.name, phase.formation, phase.target, phase.duration, arrive="caught")
 
 
 def _search_phase(at: TracedPhase, longest: float) -> tuple[np.ndarray, float, int]:
     """Torques, the time the wire takes under them, and the number of simulations."""
-    if int(at.table.status) != Status.OK:
+    if int(at.dynamics.status) != Status.OK:
         return np.zeros(2), 1.0, 0
-    series = [_raise_torque(at.table, share, longest) for share in HOLDS]
+    series = [_raise_torque(at.dynamics, share, longest) for share in HOLDS]
     count = sum(tried for *_, tried in series)
     torque, duration, _, _ = max(series, key=lambda one: (one[2] is Status.OK, one[3]))[:4]
     return torque, duration, count
 
 
-def _raise_torque(table, share: float, longest: float) -> tuple[np.ndarray, float, Status, float, int]:
+def _raise_torque(dynamics, share: float, longest: float) -> tuple[np.ndarray, float, Status, float, int]:
     """One series of raises from the best hold within a share of the torque limits: the last that worked, or of those
     that failed the one with the largest margin."""
-    limit = np.asarray(table.torque_limit)
-    tight = eqx.tree_at(lambda t: t.torque_limit, table, share * table.torque_limit)
-    begin = _hold(tight, table.breaks[0])
+    limit = np.asarray(dynamics.torque_limit)
+    tight = eqx.tree_at(lambda t: t.torque_limit, dynamics, share * dynamics.torque_limit)
+    begin = _hold(tight, dynamics.breakpoints[0])
     torque = np.clip(np.asarray(begin.torque), -share * limit, share * limit)
     if not np.isfinite(float(begin.margin)):  # no torque within this share balances
         return torque, longest, Status.STUCK, -np.inf, 0
-    pull = np.asarray(_coefficients(table, table.breaks[0])[0])[3:]
+    pull = np.asarray(_coefficients(dynamics, dynamics.breakpoints[0])[0])[3:]
     # The pushing finger is the one whose torque, raised in its own direction, accelerates the object more.
     pushing = int(np.argmax(pull * np.sign(torque)))
     kept: tuple[np.ndarray, float, Status, float] = (torque, longest, Status.STUCK, -np.inf)
     count, going = 0, True
     while going and count < MOST:
         count += 1
-        status, margin, end = _attempt(table, torque, longest)
+        status, margin, end = _attempt(dynamics, torque, longest)
         margin = margin if np.isfinite(margin) else -np.inf  # what never moves has no least force
         if status is Status.OK or (kept[2] is not Status.OK and margin > kept[3]):
             kept = (torque, end, status, margin)
@@ -127,9 +130,9 @@ def _raise_torque(table, share: float, longest: float) -> tuple[np.ndarray, floa
 _hold, _coefficients = eqx.filter_jit(best_quasistatic_torque), eqx.filter_jit(affine_coefficients)
 
 
-def _attempt(table, torque, longest) -> tuple[Status, float, float]:
+def _attempt(dynamics, torque, longest) -> tuple[Status, float, float]:
     """One simulation under constant torques: status, margin and the time at which it ended."""
     schedule = pad_schedule(TorqueSchedule(jnp.asarray([0.0, longest]), jnp.asarray(np.stack([torque, torque]))))
-    outcome = simulate_phase(table, schedule, jnp.zeros(()), jnp.asarray(longest), IntegratorOptions(), "caught")
-    end = float(outcome.motion.share[int(outcome.motion.count)]) * longest
-    return Status(int(outcome.verdict.status)), float(outcome.score.margin), max(end, 1e-6)
+    outcome = simulate_phase(dynamics, schedule, jnp.zeros(()), jnp.asarray(longest), IntegratorOptions(), "caught")
+    end = float(outcome.motion.phase_time[int(outcome.motion.count)]) * longest
+    return Status(int(outcome.assessment.status)), float(outcome.margin_result.margin), max(end, 1e-6)

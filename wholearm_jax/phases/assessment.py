@@ -5,10 +5,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core.status import Status
-from wholearm_jax.dynamics.path_dynamics import Impact, PathDynamics
-from wholearm_jax.margin.contact_forces import MarginResult, force_slack
-from wholearm_jax.simulation.phase_motion import Motion
+from wholearm_jax.core import Status
+from wholearm_jax.dynamics import Impact, PathDynamics
+from wholearm_jax.margin import MarginResult, force_slack
+from wholearm_jax.simulation import Motion
 
 DEFAULT_ARRIVAL = 1e-6  # of the wire's length: how near its end a phase that arrives at rest must come
 ARRIVAL_SPEED_FACTOR = 12.0
@@ -26,14 +26,14 @@ class Assessment(NamedTuple):
     """A phase's `status`, when as a share of its duration, and the contact concerned (-1: none)."""
 
     status: Int[Array, ""]
-    share: Float[Array, ""]
+    phase_time: Float[Array, ""]
     contact: Int[Array, ""]
 
 
 def assess_phase(
-    table: PathDynamics,
+    dynamics: PathDynamics,
     motion: Motion,
-    score: MarginResult,
+    margin_result: MarginResult,
     goal: Int[Array, ""],
     entered: Impact,
     arrival: float | Float[Array, ""] = DEFAULT_ARRIVAL,
@@ -46,32 +46,32 @@ def assess_phase(
     fails when it departs: `reversed` backward, `not_reached` forward along the way that its wire was traced.
     """
     at_rest, holds = goal == GOALS["rest"], goal == GOALS["hold"]
-    share, s, w = (values[motion.count] for values in (motion.share, motion.s, motion.w))
+    phase_time, s, w = (values[motion.count] for values in (motion.phase_time, motion.s, motion.w))
     speed = jnp.sqrt(ARRIVAL_SPEED_FACTOR * jnp.asarray(arrival, s.dtype))
-    near = jnp.abs(table.breaks[-1] - s) <= arrival * table.length
-    slow = w <= speed * table.length
-    late = share >= 1 - speed
+    near = jnp.abs(dynamics.breakpoints[-1] - s) <= arrival * dynamics.length
+    slow = w <= speed * dynamics.length
+    late = phase_time >= 1 - speed
     ended = motion.status
     there = (ended == Status.LEFT_FORMATION) | (ended == Status.OK)
     held = (ended == Status.STUCK) | ((ended == Status.REVERSED) & late)
     arrived = near & (there | held) & (slow | ~at_rest)
     finish = jnp.where(arrived, int(Status.OK), jnp.where(ended == Status.OK, int(Status.NOT_REACHED), ended))
-    stayed = motion.held[0] & (motion.share[1] >= 1)
-    departs = jnp.where(motion.held[0], motion.share[1], 0.0)
+    stayed = motion.at_rest[0] & (motion.phase_time[1] >= 1)
+    departs = jnp.where(motion.at_rest[0], motion.phase_time[1], 0.0)
     moved = (ended == Status.REVERSED) | (ended == Status.AMBIGUOUS)
-    kept = jnp.where(stayed, int(Status.OK), jnp.where(moved & (share <= departs), ended, int(Status.NOT_REACHED)))
-    finish, share = jnp.where(holds, kept, finish), jnp.where(holds, departs, share)
-    lost = jnp.isfinite(score.lost) & ~holds
+    kept = jnp.where(stayed, int(Status.OK), jnp.where(moved & (phase_time <= departs), ended, int(Status.NOT_REACHED)))
+    finish, phase_time = jnp.where(holds, kept, finish), jnp.where(holds, departs, phase_time)
+    lost = jnp.isfinite(margin_result.loss_time) & ~holds
     status = jnp.where(lost, int(Status.CONTACT_LOST), finish)
-    traced = table.status == 0
-    room = force_slack(table, entered.impulse)  # impulses have the cones of forces
+    traced = dynamics.status == 0
+    room = force_slack(dynamics, entered.impulse)  # impulses have the cones of forces
     pulls = room.min() < -IMPULSE_ROUNDING * entered.size
     back = entered.speed < 0
     refused = pulls | back
     early = jnp.where(pulls, int(Status.CONTACT_LOST), int(Status.REVERSED))
-    contact = jnp.where(pulls, jnp.argmin(room), jnp.where(lost & ~back, score.lost_contact, -1))
+    contact = jnp.where(pulls, jnp.argmin(room), jnp.where(lost & ~back, margin_result.loss_contact, -1))
     return Assessment(
-        status=jnp.where(traced, jnp.where(refused, early, status), table.status),
-        share=jnp.where(traced & ~refused, jnp.where(lost, score.lost, share), 0.0),
+        status=jnp.where(traced, jnp.where(refused, early, status), dynamics.status),
+        phase_time=jnp.where(traced & ~refused, jnp.where(lost, margin_result.loss_time, phase_time), 0.0),
         contact=jnp.where(traced, contact, -1),
     )

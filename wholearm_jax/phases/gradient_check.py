@@ -16,11 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.core.validation import require_x64
-from wholearm_jax.model.scene import Scene
-from wholearm_jax.model.schedule import TorqueSchedule
+from wholearm_jax.core import require_x64
+from wholearm_jax.model import Scene, TorqueSchedule
 from wholearm_jax.phases.plan import margin
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation import IntegratorOptions
 
 TOLERANCES = (1e-8, 1e-10, 1e-12)
 STEPS = tuple(1e-3 / 5**k for k in range(5))  # largest relative changes of the inputs for differences
@@ -66,8 +65,8 @@ def check_gradient(
 
     def value(inputs, tolerance, adjoint):
         # A tolerance that is an array is data: all tolerances share their programs.
-        how = IntegratorOptions(tolerance=jnp.asarray(tolerance), adjoint=adjoint)
-        return margin(*eqx.combine(inputs, rest), how=how)
+        options = IntegratorOptions(tolerance=jnp.asarray(tolerance), adjoint=adjoint)
+        return margin(*eqx.combine(inputs, rest), options=options)
 
     if not np.isfinite(float(value(floats, 1e-8, "none"))):
         raise ValueError("the plan has no margin to differentiate: simulate it to see why")
@@ -105,7 +104,7 @@ def _directions(floats, seed: int):
 def _steadiest(ladder: list[float]) -> tuple[float, float]:
     """The least change from one step of a ladder to the next, and where that leads; where a step leads to no margin it
     tells nothing."""
-    pairs = [(abs(fine - rough), fine) for rough, fine in itertools.pairwise(ladder)]
+    pairs = [(abs(fine - initial_guess), fine) for initial_guess, fine in itertools.pairwise(ladder)]
     return min((pair for pair in pairs if np.isfinite(pair[0])), default=(np.inf, np.nan))
 
 

@@ -8,12 +8,11 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-from wholearm_jax.core.validation import require_x64
-from wholearm_jax.model.scene import Scene
-from wholearm_jax.model.schedule import TorqueSchedule
+from wholearm_jax.core import require_x64
+from wholearm_jax.model import Scene, TorqueSchedule
 from wholearm_jax.phases.phase import TracedPhase
-from wholearm_jax.phases.plan import plan_margin, simulate_phases, with_plan_step_capacity, has_torque_jumps, trace
-from wholearm_jax.simulation.integrator import IntegratorOptions, tolerance_as_data
+from wholearm_jax.phases.plan import has_torque_jumps, plan_margin, simulate_phases, trace, with_plan_step_capacity
+from wholearm_jax.simulation import IntegratorOptions, tolerance_as_data
 
 MAX_FORWARD_DIRECTIONS = 2
 
@@ -32,9 +31,11 @@ def torque_gradient(
     (12, 2)
     """
     require_x64()
-    how = IntegratorOptions(tolerance=tolerance, adjoint=choose_mode(torque), steps=has_torque_jumps(scene, torque))
-    how = tolerance_as_data(with_plan_step_capacity(how, scene, torque), torque.times.dtype)
-    return _gradient(scene, torque, traced or trace(scene), how)
+    options = IntegratorOptions(
+        tolerance=tolerance, adjoint=choose_mode(torque), has_jumps=has_torque_jumps(scene, torque)
+    )
+    options = tolerance_as_data(with_plan_step_capacity(options, scene, torque), torque.times.dtype)
+    return _gradient(scene, torque, traced or trace(scene), options)
 
 
 def choose_mode(torque: TorqueSchedule) -> str:
@@ -43,11 +44,11 @@ def choose_mode(torque: TorqueSchedule) -> str:
 
 
 @eqx.filter_jit
-def _gradient(scene, torque, traced, how):
+def _gradient(scene, torque, traced, options):
     def value(values):
-        m = plan_margin(scene, simulate_phases(scene, TorqueSchedule(torque.times, values), traced, how))
+        m = plan_margin(scene, simulate_phases(scene, TorqueSchedule(torque.times, values), traced, options))
         return m, m
 
-    derivative = jax.jacfwd if how.adjoint == "forward" else jax.grad
+    derivative = jax.jacfwd if options.adjoint == "forward" else jax.grad
     slope, m = derivative(value, has_aux=True)(torque.values)
     return m, slope

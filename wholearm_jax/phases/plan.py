@@ -14,26 +14,39 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core.arrays import as_device_array
-from wholearm_jax.core.programs import BackgroundCall, call_in_background, is_transformed, wait_for
-from wholearm_jax.core.status import Status
-from wholearm_jax.core.validation import require_positive, require_x64
-from wholearm_jax.model.mechanics import scaled_mechanics
-from wholearm_jax.model.scene import Phase, Scene, rigid_body
-from wholearm_jax.model.schedule import TorqueSchedule, has_jumps, pad_schedule, round_up
+from wholearm_jax.core import (
+    BackgroundCall,
+    Status,
+    as_device_array,
+    call_in_background,
+    is_transformed,
+    require_positive,
+    require_x64,
+    wait_for,
+)
+from wholearm_jax.model import (
+    Phase,
+    Scene,
+    TorqueSchedule,
+    has_jumps,
+    pad_schedule,
+    rigid_body,
+    round_up,
+    scaled_mechanics,
+)
 from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL, GOALS
 from wholearm_jax.phases.phase import (
     SimulatedPhase,
     TracedPhase,
-    target_configuration,
-    trace_phase_path,
-    trace_phase,
-    simulate_phase,
     precompile_simulation,
+    simulate_phase,
+    target_configuration,
+    trace_phase,
+    trace_phase_path,
 )
 from wholearm_jax.phases.result import Result, build_result
-from wholearm_jax.simulation.integrator import IntegratorOptions, tolerance_as_data, with_step_capacity
-from wholearm_jax.tracing.path import Resolution, ContactPath
+from wholearm_jax.simulation import IntegratorOptions, tolerance_as_data, with_step_capacity
+from wholearm_jax.tracing import ContactPath, Resolution
 
 TABLE_ROUNDING = 1e4  # of a precision's last digit, the interpolation error that more panels do not make smaller
 
@@ -43,27 +56,27 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
 
     The table of a phase is refined (panels doubled, up to 512) until its interpolation error, relative to each
     function's size, is below `tolerance`; pieces are added likewise. What cannot be traced says so in
-    `TracedPhase.table.status`, and what follows it cannot be trusted.
+    `TracedPhase.dynamics.status`, and what follows it cannot be trusted.
 
     The paper's "set of C-functions equated to zero", solved along the whole wire (derivation, section 3).
 
     >>> traced = wa.trace(wa.load("heptagon"))
-    >>> [wa.Status(int(one.table.status)).label for one in traced]
+    >>> [wa.Status(int(one.dynamics.status)).label for one in traced]
     ['ok', 'ok']
-    >>> print(f"{float(traced[0].table.length):.2f} object radii")
+    >>> print(f"{float(traced[0].dynamics.length):.2f} object radii")
     1.33 object radii
     """
     if is_transformed(scene):  # shapes are fixed there: the caller has chosen the resolution
         return unstack_trees(trace_in_one_program(scene, resolution), len(scene.phases))
-    solid, rough, found = rigid_body(scene.object), scene.start, []
+    solid, initial_guess, found = rigid_body(scene.object), scene.start, []
     for phase in scene.phases:
-        begin = rough, as_device_array(not found)
+        begin = initial_guess, as_device_array(not found)
         traced = _trace_refined(solid, scene, phase, *begin, resolution, tolerance)
-        if phase.arrive == "hold" and int(traced.table.status) != Status.OK:
-            other = eqx.tree_at(lambda p: p.heading.sign, phase, -phase.heading.sign)
+        if phase.arrive == "hold" and int(traced.dynamics.status) != Status.OK:
+            other = eqx.tree_at(lambda p: p.target.sign, phase, -phase.target.sign)
             traced = _trace_refined(solid, scene, other, *begin, resolution, tolerance)
         found.append(traced)
-        rough = target_configuration(phase, traced)
+        initial_guess = target_configuration(phase, traced)
     return tuple(found)
 
 
@@ -74,8 +87,10 @@ def trace_in_one_program(scene: Scene, resolution: Resolution) -> TracedPhase:
 
     def one(at, phase):
         """Trace a phase from where the one before it ended."""
-        (rough, first), (formation, heading, holds) = at, phase
-        traced = trace_phase(solid, scene.hand, scene.gravity, formation, rough, heading, resolution, first, holds)
+        (initial_guess, first), (formation, target, holds) = at, phase
+        traced = trace_phase(
+            solid, scene.hand, scene.gravity, formation, initial_guess, target, resolution, first, holds
+        )
         return (jnp.where(holds, traced.begin, traced.end), jnp.asarray(False)), traced
 
     return jax.lax.scan(one, (scene.start, jnp.asarray(True)), _trace_inputs(scene))[1]
@@ -86,17 +101,17 @@ def trace_paths_in_one_program(scene: Scene, resolution: Resolution) -> ContactP
     solid = rigid_body(scene.object)
 
     def one(at, phase):
-        (rough, first), (formation, heading, holds) = at, phase
+        (initial_guess, first), (formation, target, holds) = at, phase
         mechanics = scaled_mechanics(solid, scene.hand, scene.gravity, formation)
-        wire, begin, end = trace_phase_path(mechanics, rough, heading, resolution, first, holds)
-        return (jnp.where(holds, begin, end), jnp.asarray(False)), wire
+        path, begin, end = trace_phase_path(mechanics, initial_guess, target, resolution, first, holds)
+        return (jnp.where(holds, begin, end), jnp.asarray(False)), path
 
     return jax.lax.scan(one, (scene.start, jnp.asarray(True)), _trace_inputs(scene))[1]
 
 
 def _trace_inputs(scene: Scene):
     """What a plan says of its phases' wires, with an axis of phases: formation, heading, and whether it only holds."""
-    return stack_trees([(p.formation, p.heading, jnp.asarray(p.arrive == "hold")) for p in scene.phases])
+    return stack_trees([(p.formation, p.target, jnp.asarray(p.arrive == "hold")) for p in scene.phases])
 
 
 def stack_trees(several):
@@ -109,45 +124,55 @@ def unstack_trees(together, count: int) -> tuple:
     return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], together) for k in range(count))
 
 
-def _trace_refined(solid, scene, phase: Phase, rough, first, resolution: Resolution, tolerance: float) -> TracedPhase:
-    told, holds = (phase.formation, rough, phase.heading), as_device_array(phase.arrive == "hold")
+def _trace_refined(
+    solid, scene, phase: Phase, initial_guess, first, resolution: Resolution, tolerance: float
+) -> TracedPhase:
+    told, holds = (phase.formation, initial_guess, phase.target), as_device_array(phase.arrive == "hold")
     while True:
         traced = trace_phase(solid, scene.hand, scene.gravity, *told, resolution, first, holds)
-        table = traced.table
-        least_error = TABLE_ROUNDING * jnp.finfo(table.breaks.dtype).eps
-        coarse = float(table.error) > max(tolerance, least_error) and int(table.status) == Status.OK
-        full = int(table.count) >= resolution.pieces
-        if full and resolution.pieces < 48:
-            resolution = resolution._replace(pieces=2 * resolution.pieces, panels=2 * resolution.panels)
+        dynamics = traced.dynamics
+        least_error = TABLE_ROUNDING * jnp.finfo(dynamics.breakpoints.dtype).eps
+        coarse = float(dynamics.error) > max(tolerance, least_error) and int(dynamics.status) == Status.OK
+        full = int(dynamics.count) >= resolution.segments
+        if full and resolution.segments < 48:
+            resolution = resolution._replace(segments=2 * resolution.segments, panels=2 * resolution.panels)
         elif coarse and resolution.panels < 512:
             resolution = resolution._replace(panels=2 * resolution.panels)
         elif coarse or full:
-            return eqx.tree_at(lambda t: t.table.status, traced, jnp.asarray(int(Status.NO_CONVERGENCE), int))
+            return eqx.tree_at(lambda t: t.dynamics.status, traced, jnp.asarray(int(Status.NO_CONVERGENCE), int))
         else:
             return traced
 
 
 def simulate_phases(
-    scene: Scene, torque: TorqueSchedule, traced: tuple[TracedPhase, ...], how: IntegratorOptions, arrival: float = DEFAULT_ARRIVAL
+    scene: Scene,
+    torque: TorqueSchedule,
+    traced: tuple[TracedPhase, ...],
+    options: IntegratorOptions,
+    arrival: float = DEFAULT_ARRIVAL,
 ) -> tuple[SimulatedPhase, ...]:
     """Simulate every phase; differentiable, and usable under any JAX transformation."""
     alike = len({tuple(leaf.shape for leaf in jax.tree.leaves(one)) for one in traced}) == 1
     if alike and is_transformed(scene, torque, traced):
-        phases = stack_trees([(at.table, *phase_inputs(phase)) for at, phase in zip(traced, scene.phases, strict=True)])
+        phases = stack_trees(
+            [(at.dynamics, *phase_inputs(phase)) for at, phase in zip(traced, scene.phases, strict=True)]
+        )
         dtype = torque.times.dtype
-        how = tolerance_as_data(how, dtype)
-        return unstack_trees(_simulate_in_one_program(phases, pad_schedule(torque), how, jnp.asarray(arrival, dtype)), len(traced))
+        options = tolerance_as_data(options, dtype)
+        return unstack_trees(
+            _simulate_in_one_program(phases, pad_schedule(torque), options, jnp.asarray(arrival, dtype)), len(traced)
+        )
     at, found, schedule = initial_carry(torque), [], pad_schedule(torque)
     for phase, one in zip(scene.phases, traced, strict=True):
-        at, outcome = scan_step(schedule, how, arrival, at, (one.table, *phase_inputs(phase)))
+        at, outcome = scan_step(schedule, options, arrival, at, (one.dynamics, *phase_inputs(phase)))
         found.append(outcome)
     return tuple(found)
 
 
 @eqx.filter_jit
-def _simulate_in_one_program(phases, schedule: TorqueSchedule, how: IntegratorOptions, arrival) -> SimulatedPhase:
+def _simulate_in_one_program(phases, schedule: TorqueSchedule, options: IntegratorOptions, arrival) -> SimulatedPhase:
     """Every phase of a plan in one program: `SimulatedPhase` with an axis of phases."""
-    return jax.lax.scan(partial(scan_step, schedule, how, arrival), initial_carry(schedule), phases)[1]
+    return jax.lax.scan(partial(scan_step, schedule, options, arrival), initial_carry(schedule), phases)[1]
 
 
 def initial_carry(torque: TorqueSchedule):
@@ -161,11 +186,11 @@ def phase_inputs(phase: Phase):
     return phase.duration, as_device_array(GOALS[phase.arrive], int), as_device_array(phase.arrive == "moving")
 
 
-def scan_step(schedule: TorqueSchedule, how: IntegratorOptions, arrival, at, phase):
+def scan_step(schedule: TorqueSchedule, options: IntegratorOptions, arrival, at, phase):
     """Simulate the next phase of a plan, from when the one before it ended: one step of a scan."""
-    (start, planned, arriving), (table, duration, goal, passes) = at, phase
+    (start, planned, incoming_velocity), (dynamics, duration, goal, passes) = at, phase
     planned, length = _planned_end(planned, duration, start)
-    one = simulate_phase(table, schedule, start, length, how, goal, arriving, arrival)
+    one = simulate_phase(dynamics, schedule, start, length, options, goal, incoming_velocity, arrival)
     return _next_start(planned, passes, one), one
 
 
@@ -179,15 +204,15 @@ def _planned_end(before, duration, start):
 @jax.jit
 def _next_start(planned, passes, one: SimulatedPhase):
     """When the next phase begins, when this one should have ended, and at which `z_dot`."""
-    ended = one.start + one.duration * one.motion.share[one.motion.count]
-    return jnp.where(passes, ended, planned), planned, jnp.where(passes, one.leaving, 0.0)
+    ended = one.start + one.duration * one.motion.phase_time[one.motion.count]
+    return jnp.where(passes, ended, planned), planned, jnp.where(passes, one.exit_velocity, 0.0)
 
 
 def margin(
     scene: Scene,
     torque: TorqueSchedule,
     *,
-    how: IntegratorOptions = IntegratorOptions(adjoint="both"),
+    options: IntegratorOptions = IntegratorOptions(adjoint="both"),
     resolution: Resolution = Resolution(),
 ) -> Float[Array, ""]:
     """The compressive margin [N] of a plan: the least `c_n` over time and contacts (and, of those that roll, the least
@@ -197,7 +222,7 @@ def margin(
     where a contact would pull; `-inf` where a phase has no motion to score, or its wire is not known. Whether the plan
     succeeds is for `simulate` to say. Phases that hold the object do not count. That the schedule steps is seen where
     its times and the durations are numbers; where they are transformed too, say so: `how=Integration(adjoint="both",
-    steps=True)`.
+    has_jumps=True)`.
 
     The forces are those of the paper's section 2.2, its `c_n > 0` (derivation, sections 4 and 7).
     In float32 it has four digits (`docs/accuracy.md`).
@@ -206,8 +231,10 @@ def margin(
     >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")
     0.70 N
     """
-    how = replace(with_plan_step_capacity(how, scene, torque), steps=how.steps or has_torque_jumps(scene, torque))
-    return plan_margin(scene, simulate_phases(scene, torque, trace(scene, resolution=resolution), how))
+    options = replace(
+        with_plan_step_capacity(options, scene, torque), has_jumps=options.has_jumps or has_torque_jumps(scene, torque)
+    )
+    return plan_margin(scene, simulate_phases(scene, torque, trace(scene, resolution=resolution), options))
 
 
 def plan_margin(scene: Scene, found: tuple[SimulatedPhase, ...]) -> Float[Array, ""]:
@@ -215,7 +242,7 @@ def plan_margin(scene: Scene, found: tuple[SimulatedPhase, ...]) -> Float[Array,
 
     Raises ValueError for a plan that only holds its object.
     """
-    moving = [o.score.margin for o, p in zip(found, scene.phases, strict=True) if p.arrive != "hold"]
+    moving = [o.margin_result.margin for o, p in zip(found, scene.phases, strict=True) if p.arrive != "hold"]
     if not moving:
         raise ValueError("a plan that only holds its object has no margin of a motion, see Result.hold_margin")
     return jnp.stack([jnp.where(jnp.isfinite(m), m, -jnp.inf) for m in moving]).min()
@@ -254,7 +281,7 @@ def simulate(
     Integrates the paper's eq. (16) (derivation, section 6). Raises RuntimeError without float64.
 
     >>> scene = wa.load("heptagon")
-    >>> result = wa.simulate(scene, wa.torque([0.0, 2.0], [[0.0, 0.0], [0.0, 0.0]]))
+    >>> result = wa.simulate(scene, wa.torque_schedule([0.0, 2.0], [[0.0, 0.0], [0.0, 0.0]]))
     >>> result.status.label, result.phases[0].status.label
     ('stuck', 'stuck')
     >>> print(result.message.rpartition(":")[0])
@@ -268,25 +295,33 @@ def simulate(
         traced = trace(scene)
         wait_for(compiled)
     while True:
-        found = simulate_phases(scene, torque, traced, _integrator_options(scene, torque, tolerance, max_steps), arrival)
-        short = any(int(o.verdict.status) == Status.MAX_STEPS for o in found)
+        found = simulate_phases(
+            scene, torque, traced, _integrator_options(scene, torque, tolerance, max_steps), arrival
+        )
+        short = any(int(o.assessment.status) == Status.MAX_STEPS for o in found)
         if not short or max_steps >= 16384:
             return build_result(scene, torque, traced, found)
         max_steps *= 4
 
 
-def precompile_simulate(scene: Scene, torque: TorqueSchedule, tolerance: float = 1e-10, max_steps: int = 256) -> BackgroundCall:
+def precompile_simulate(
+    scene: Scene, torque: TorqueSchedule, tolerance: float = 1e-10, max_steps: int = 256
+) -> BackgroundCall:
     """Compile what `simulate` runs in a thread of its own, while wires are traced; it is to be waited for."""
-    return call_in_background(precompile_simulation, round_up(len(torque.times)), _integrator_options(scene, torque, tolerance, max_steps))
+    return call_in_background(
+        precompile_simulation, round_up(len(torque.times)), _integrator_options(scene, torque, tolerance, max_steps)
+    )
 
 
 def _integrator_options(scene: Scene, torque: TorqueSchedule, tolerance: float, max_steps: int) -> IntegratorOptions:
     """How `simulate` integrates."""
     stages, steps = max(8, max_steps // 32), has_torque_jumps(scene, torque)
-    return with_plan_step_capacity(IntegratorOptions(tolerance=tolerance, max_steps=max_steps, stages=stages, steps=steps), scene, torque)
+    return with_plan_step_capacity(
+        IntegratorOptions(tolerance=tolerance, max_steps=max_steps, max_stages=stages, has_jumps=steps), scene, torque
+    )
 
 
-def with_plan_step_capacity(how: IntegratorOptions, scene: Scene, torque: TorqueSchedule) -> IntegratorOptions:
+def with_plan_step_capacity(options: IntegratorOptions, scene: Scene, torque: TorqueSchedule) -> IntegratorOptions:
     """The same integration with room for the steps of a phase under a schedule (`stepping.with_step_capacity`).
 
     Counted are the rows within a phase, or all where times or durations are being transformed.
@@ -295,7 +330,7 @@ def with_plan_step_capacity(how: IntegratorOptions, scene: Scene, torque: Torque
     if not is_transformed(torque.times, [phase.duration for phase in scene.phases]):
         ends = np.cumsum([0.0, *(float(phase.duration) for phase in scene.phases)])
         rows = int(np.max(np.diff(np.searchsorted(np.asarray(torque.times), ends))))
-    return with_step_capacity(how, rows)
+    return with_step_capacity(options, rows)
 
 
 def has_torque_jumps(scenes: Scene, torque: TorqueSchedule) -> bool:

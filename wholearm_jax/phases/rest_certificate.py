@@ -12,57 +12,78 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from wholearm_jax.core.lookup import take_row
-from wholearm_jax.core.small_linalg import inverse_and_determinant, fused_matmul
-from wholearm_jax.dynamics.path_dynamics import PathDynamics, equations_of_motion, evaluate, locate_panel
-from wholearm_jax.margin.contact_forces import force_slack
-from wholearm_jax.model.mechanics import ScaledMechanics
-from wholearm_jax.model.schedule import TIME_ROUNDING, TorqueSchedule, PhaseSchedule, torque_at, restrict_to_phase
+from wholearm_jax.core import fused_matmul, inverse_and_determinant, take_row
+from wholearm_jax.dynamics import PathDynamics, equations_of_motion, evaluate, locate_panel
+from wholearm_jax.margin import force_slack
+from wholearm_jax.model import (
+    TIME_ROUNDING,
+    PhaseSchedule,
+    ScaledMechanics,
+    TorqueSchedule,
+    restrict_to_phase,
+    torque_at,
+)
 from wholearm_jax.phases.phase import SimulatedPhase
 from wholearm_jax.phases.result import MIN_REST
-from wholearm_jax.simulation.phase_motion import Motion
+from wholearm_jax.simulation import Motion
 
 
-def certify_rest(mechanics: ScaledMechanics, table: PathDynamics, schedule: TorqueSchedule, done: SimulatedPhase) -> Bool[Array, ""]:
+def certify_rest(
+    mechanics: ScaledMechanics, dynamics: PathDynamics, schedule: TorqueSchedule, done: SimulatedPhase
+) -> Bool[Array, ""]:
     """Whether every time that friction holds the object at rest in a phase is proved to be possible."""
     motion = done.motion
-    rows = jnp.arange(motion.held.shape[0])
-    rests = motion.held & (rows < motion.count) & (jnp.diff(motion.share) > MIN_REST)
+    rows = jnp.arange(motion.at_rest.shape[0])
+    rests = motion.at_rest & (rows < motion.count) & (jnp.diff(motion.phase_time) > MIN_REST)
 
     def all_proved():
-        seen = restrict_to_phase(schedule, done.start, done.duration)
+        phase_schedule = restrict_to_phase(schedule, done.start, done.duration)
 
         def next_rest(at):
             left, _ = at
             k = jnp.argmax(left)
-            return left.at[k].set(False), _certify_interval(mechanics, table, seen, motion, k)
+            return left.at[k].set(False), _certify_interval(mechanics, dynamics, phase_schedule, motion, k)
 
         return jax.lax.while_loop(lambda at: at[1] & at[0].any(), next_rest, (rests, jnp.asarray(True)))[1]
 
     return jax.lax.cond(rests.any(), all_proved, lambda: jnp.asarray(True))
 
 
-def _certify_interval(mechanics: ScaledMechanics, table: PathDynamics, seen: PhaseSchedule, motion: Motion, k) -> Bool[Array, ""]:
+def _certify_interval(
+    mechanics: ScaledMechanics, dynamics: PathDynamics, phase_schedule: PhaseSchedule, motion: Motion, k
+) -> Bool[Array, ""]:
     """Whether one rest, step `k` of a motion, is."""
-    piece, begin, end = take_row(motion.piece, k), take_row(motion.share, k), take_row(motion.share, k + 1)
-    panel, xi = locate_panel(table, piece, take_row(motion.s, k))
+    segment, begin, end = (
+        take_row(motion.segment, k),
+        take_row(motion.phase_time, k),
+        take_row(motion.phase_time, k + 1),
+    )
+    panel, xi = locate_panel(dynamics, segment, take_row(motion.s, k))
     z, x = (
-        evaluate(values, panel, xi) / mechanics.configuration_unit for values in (table.configuration, table.velocity)
+        evaluate(values, panel, xi) / mechanics.configuration_unit
+        for values in (dynamics.configuration, dynamics.velocity)
     )
     friction = mechanics.contacts.friction
-    sliding = -take_row(table.tension, piece) / jnp.where(friction > 0, friction, 1.0)  # signs of slip, as traced
+    sliding = -take_row(dynamics.friction_ratio, segment) / jnp.where(
+        friction > 0, friction, 1.0
+    )  # signs of slip, as traced
     # At a step the torque is that before it where a rest ends, and that behind it where one begins.
     near = TIME_ROUNDING * jnp.finfo(end.dtype).eps
-    first, last = (seen.share <= begin + near).sum() - 1, (seen.share < end - near).sum() - 1
-    rows = (jnp.clip(row, seen.first, seen.last) for row in (first, last))
-    ends = jnp.stack([torque_at(seen, row, at) for row, at in zip(rows, (begin, end), strict=True)])
-    inside = (seen.share > begin + near) & (seen.share < end - near)
-    corners = jnp.concatenate([ends, jnp.where(inside[:, None], seen.values, ends[0])]) / mechanics.torque_unit
+    first, last = (
+        (phase_schedule.phase_time <= begin + near).sum() - 1,
+        (phase_schedule.phase_time < end - near).sum() - 1,
+    )
+    rows = (jnp.clip(row, phase_schedule.first, phase_schedule.last) for row in (first, last))
+    ends = jnp.stack([torque_at(phase_schedule, row, at) for row, at in zip(rows, (begin, end), strict=True)])
+    inside = (phase_schedule.phase_time > begin + near) & (phase_schedule.phase_time < end - near)
+    corners = (
+        jnp.concatenate([ends, jnp.where(inside[:, None], phase_schedule.values, ends[0])]) / mechanics.torque_unit
+    )
     terms = jnp.concatenate([jnp.ones_like(corners[:, :1]), corners], axis=1)
 
     def within(sign):
         matrix, right = equations_of_motion(mechanics, z, x, jnp.zeros_like(x), sign * sliding, sign * jnp.sign(x[3:]))
         solved = fused_matmul(inverse_and_determinant(matrix)[0], right[:, jnp.array([0, 3, 4])])[1:]
-        return jax.vmap(lambda one: force_slack(table, fused_matmul(solved, one)))(terms).min() >= 0
+        return jax.vmap(lambda one: force_slack(dynamics, fused_matmul(solved, one)))(terms).min() >= 0
 
     return jax.lax.map(within, jnp.array([1.0, -1.0])).all()

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 
-from wholearm_jax.core.status import Status
-from wholearm_jax.margin.statics import RestInterval, contact_statics, rest_margin
-from wholearm_jax.model.scene import Phase, Scene
-from wholearm_jax.model.schedule import TorqueSchedule
+from wholearm_jax.core import Status
+from wholearm_jax.margin import RestInterval, contact_statics, rest_margin
+from wholearm_jax.model import Phase, Scene, TorqueSchedule
 from wholearm_jax.phases.phase import SimulatedPhase, TracedPhase, configuration
 
 SLIP_TOL = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
@@ -76,14 +75,14 @@ class Result:
         return next((p.status for p in self.phases if p.status is not Status.OK), Status.OK)
 
     @property
-    def hardest(self) -> PhaseResult:
+    def critical_phase(self) -> PhaseResult:
         """The phase whose margin is the plan's."""
         moving = [p for p in self.phases if p.arrive != "hold"]
         return min(moving or self.phases, key=lambda p: p.margin)
 
     @property
     def margin(self) -> float:
-        return self.hardest.margin
+        return self.critical_phase.margin
 
     @property
     def hold_margin(self) -> float | None:
@@ -101,24 +100,24 @@ def build_result(scene: Scene, torque: TorqueSchedule, traced, found) -> Result:
     rows = []
     for phase, at, outcome in zip(scene.phases, traced, found, strict=True):
         names, start, length = phase.formation.names, float(outcome.start), float(outcome.duration)
-        verdict, scored = outcome.verdict, outcome.score
-        slot, of_slot = int(verdict.contact), phase.formation.contact_of_slot
-        known = bool(np.isfinite(scored.margin)) and int(at.table.status) == Status.OK
+        assessment, scored = outcome.assessment, outcome.margin_result
+        slot, of_slot = int(assessment.contact), phase.formation.contact_of_row
+        known = bool(np.isfinite(scored.margin)) and int(at.dynamics.status) == Status.OK
         one = PhaseResult(
             name=phase.name,
             arrive=phase.arrive,
             contacts=names,
-            status=Status(int(verdict.status)),
-            time=start + length * float(verdict.share),
+            status=Status(int(assessment.status)),
+            time=start + length * float(assessment.phase_time),
             contact=names[of_slot[slot]] if slot >= 0 else None,
             slips=slot >= 0 and bool(phase.formation.tangential[slot]),
             start=start,
             duration=length,
             margin=float(scored.margin) if known else float("-inf"),
-            margin_time=start + length * float(scored.share),
+            margin_time=start + length * float(scored.phase_time),
             margin_s=float(scored.s),
             margin_contact=names[of_slot[int(scored.contact)]],
-            impulses=tuple(float(np.asarray(outcome.entered.impulse)[k]) for k in phase.formation.normal_slots),
+            impulses=tuple(float(np.asarray(outcome.impact.impulse)[k]) for k in phase.formation.normal_rows),
             holds=rest_intervals(scene, torque, phase, at, outcome),
             traced=at,
             outcome=outcome,
@@ -127,16 +126,20 @@ def build_result(scene: Scene, torque: TorqueSchedule, traced, found) -> Result:
     return Result(scene, torque, tuple(rows))
 
 
-def rest_intervals(scene: Scene, torque: TorqueSchedule, phase: Phase, traced: TracedPhase, outcome: SimulatedPhase) -> tuple[RestInterval, ...]:
+def rest_intervals(
+    scene: Scene, torque: TorqueSchedule, phase: Phase, traced: TracedPhase, outcome: SimulatedPhase
+) -> tuple[RestInterval, ...]:
     """Every time that friction holds the object at rest in a phase: waiting to start, or stopped on the way."""
     motion = jax.device_get(outcome.motion)
-    if int(traced.table.status) != Status.OK:
+    if int(traced.dynamics.status) != Status.OK:
         return ()
     start, duration = float(outcome.start), float(outcome.duration)
     found = []
-    for k in np.flatnonzero(motion.held[: int(motion.count)] & (np.diff(motion.share)[: int(motion.count)] > MIN_REST)):
-        z = configuration(traced.table, motion.piece[k], motion.s[k])
-        begin, end = (start + duration * float(share) for share in motion.share[k : k + 2])
+    for k in np.flatnonzero(
+        motion.at_rest[: int(motion.count)] & (np.diff(motion.phase_time)[: int(motion.count)] > MIN_REST)
+    ):
+        z = configuration(traced.dynamics, motion.segment[k], motion.s[k])
+        begin, end = (start + duration * float(share) for share in motion.phase_time[k : k + 2])
         found.append(rest_margin(contact_statics(scene, phase.formation, z), torque, begin, end))
     return tuple(found)
 
@@ -146,8 +149,8 @@ def _with_holds(phase: PhaseResult) -> PhaseResult:
     if phase.arrive == "hold" and phase.holds:
         least = min(phase.holds, key=lambda held: held.margin)
         numbers = {"margin": least.margin, "margin_time": least.time, "margin_contact": least.contact}
-        phase = replace(phase, **numbers, margin_s=float(phase.traced.table.breaks[0]))
-    failed = next((held for held in phase.holds if held.lost is not None), None)
-    if failed is None or failed.lost is None or (phase.status is not Status.OK and phase.time < failed.lost):
+        phase = replace(phase, **numbers, margin_s=float(phase.traced.dynamics.breakpoints[0]))
+    failed = next((held for held in phase.holds if held.loss_time is not None), None)
+    if failed is None or failed.loss_time is None or (phase.status is not Status.OK and phase.time < failed.loss_time):
         return phase
-    return replace(phase, status=Status.CONTACT_LOST, time=failed.lost, contact=failed.contact, slips=False)
+    return replace(phase, status=Status.CONTACT_LOST, time=failed.loss_time, contact=failed.contact, slips=False)

@@ -14,16 +14,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core.arrays import as_device_array
-from wholearm_jax.core.status import Status
-from wholearm_jax.dynamics.path_dynamics import PathDynamics, resolve_impact, evaluate, locate_panel
-from wholearm_jax.margin.quasistatic import MarginBound, margin_upper_bound, best_quasistatic_torque
-from wholearm_jax.model.contact_kinematics import contact_candidates, contact_kinematics, normal_jacobian
-from wholearm_jax.model.mechanics import scaled_mechanics
-from wholearm_jax.model.scene import COORDINATES, Phase, Scene, rigid_body, contact_name, contact_formation, path_target
-from wholearm_jax.phases.assessment import IMPULSE_ROUNDING
-from wholearm_jax.phases.phase import TracedPhase, describe_end, trace_phase
-from wholearm_jax.tracing.path import Resolution
+from wholearm_jax.core import Status, as_device_array
+from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel, resolve_impact
+from wholearm_jax.margin import MarginBound, best_quasistatic_torque, margin_upper_bound
+from wholearm_jax.model import (
+    COORDINATES,
+    Phase,
+    Scene,
+    contact_candidates,
+    contact_formation,
+    contact_kinematics,
+    contact_name,
+    normal_jacobian,
+    path_target,
+    rigid_body,
+    scaled_mechanics,
+)
+from wholearm_jax.phases import IMPULSE_ROUNDING, TracedPhase, describe_end, trace_phase
+from wholearm_jax.tracing import Resolution
 
 CONTACT_TOL = 1e-7  # gap, in the object's radius, below which a contact touches
 MIN_PATH_LENGTH = 1e-3  # wire length, in the object's radius, below which a way leads nowhere
@@ -61,10 +69,10 @@ class Successor:
 
 
 @jax.jit
-def exit_velocity(table: PathDynamics) -> Float[Array, "5"]:
+def exit_velocity(dynamics: PathDynamics) -> Float[Array, "5"]:
     """`z_dot` (SI) at a wire's end for `ds/dt = 1`."""
-    panel, xi = locate_panel(table, table.count - 1, table.breaks[-1])
-    return evaluate(table.velocity, panel, xi)
+    panel, xi = locate_panel(dynamics, dynamics.count - 1, dynamics.breakpoints[-1])
+    return evaluate(dynamics.velocity, panel, xi)
 
 
 def touching_contacts(scene: Scene, z: Float[Array, "5"]) -> tuple[str, ...]:
@@ -87,7 +95,9 @@ def _near(scene, z, pairs):
     return inside & (jnp.abs(at.gap) < CONTACT_TOL) & (pairs.feature < solid.count)
 
 
-def successor_formations(scene: Scene, z: Float[Array, "5"], z_dot: Float[Array, "5"] | None = None) -> tuple[Successor, ...]:
+def successor_formations(
+    scene: Scene, z: Float[Array, "5"], z_dot: Float[Array, "5"] | None = None
+) -> tuple[Successor, ...]:
     """Every formation of four contacts that touch at `z` (SI), both ways, best static margin first.
 
     `z_dot` (SI) is the speed with which the object arrives there, if it does.
@@ -124,14 +134,14 @@ def _successor(scene, z, z_dot, names, chosen, toward: str) -> Successor | None:
     onward = path_target(toward)
     told, plain = (rigid_body(scene.object), scene.hand, scene.gravity, chosen, z, onward), as_device_array(True)
     traced = trace_phase(*told, Resolution(), plain, plain)  # as `trace` does: one program
-    table = traced.table
-    status, length = Status(int(table.status)), float(table.length)
+    dynamics = traced.dynamics
+    status, length = Status(int(dynamics.status)), float(dynamics.length)
     if status is Status.OK and length < MIN_PATH_LENGTH:
         return None
     phase = Phase("", chosen, onward, jnp.ones(()))
     known = status is Status.OK
-    top, static = (float(v) for v in _value(table)) if known else (float("-inf"), float("-inf"))
-    entered = resolve_impact(table, jnp.zeros(5) if z_dot is None else z_dot)
+    top, static = (float(v) for v in _value(dynamics)) if known else (float("-inf"), float("-inf"))
+    entered = resolve_impact(dynamics, jnp.zeros(5) if z_dot is None else z_dot)
     impulse = np.asarray(entered.impulse)
     return Successor(
         contacts=tuple(names),
@@ -149,6 +159,6 @@ def _successor(scene, z, z_dot, names, chosen, toward: str) -> Successor | None:
 
 
 @jax.jit
-def _value(table):
-    top: MarginBound = margin_upper_bound(table, jnp.ones(()))
-    return top.value, best_quasistatic_torque(table, table.breaks[0]).margin
+def _value(dynamics):
+    top: MarginBound = margin_upper_bound(dynamics, jnp.ones(()))
+    return top.value, best_quasistatic_torque(dynamics, dynamics.breakpoints[0]).margin

@@ -9,8 +9,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from wholearm_jax.core.status import Status
-from wholearm_jax.ensembles.summary import EnsembleSummary
+from wholearm_jax.core import Status
+from wholearm_jax.ensembles import EnsembleSummary
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
 from wholearm_jax.plotting.plan_figures import INK
 

@@ -13,13 +13,13 @@ from matplotlib.animation import FuncAnimation
 from matplotlib.axes import Axes
 from matplotlib.patches import Polygon as Patch
 
-from wholearm_jax.model.scene import rigid_body, feature_pair
+from wholearm_jax.model import feature_pair, rigid_body
 from wholearm_jax.plotting.palette import CONTACT_COLOURS, contact_styles
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
 from wholearm_jax.plotting.plan_figures import INK, PAGE, PALE, draw_pose, outline_at, over_time, pose_grid
 
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
-    from wholearm_jax.execution.rollout import Execution
+    from wholearm_jax.execution import Execution
 
 
 def draw_execution(execution: Execution, axes=None) -> np.ndarray:

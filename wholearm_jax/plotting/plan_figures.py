@@ -17,15 +17,14 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon as Patch
 from matplotlib.transforms import ScaledTranslation
 
-from wholearm_jax.core.atomic_files import write_atomically
-from wholearm_jax.model.scene import Scene, rigid_body, parse_contact
-from wholearm_jax.phases.result import Result
-from wholearm_jax.phases.sampling import trajectory
+from wholearm_jax.core import write_atomically
+from wholearm_jax.model import Scene, parse_contact, rigid_body
+from wholearm_jax.phases import Result, trajectory
 from wholearm_jax.plotting.palette import CONTACT_COLOURS, DASHES, contact_styles
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
 
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
-    from wholearm_jax.optimisation.optimiser import OptimisationResult
+    from wholearm_jax.optimisation import OptimisationResult
 
 COLUMN, PAGE = 3.5, 7.16  # widths of one column and of two in the field's journals [inch]
 
@@ -191,7 +190,7 @@ def _draw_holds(result: Result, ax: Axes) -> None:
 
 def _mark_margin(result: Result, ax: Axes) -> None:
     """A dot at the margin, and its words below the curves."""
-    worst = result.hardest
+    worst = result.critical_phase
     if not np.isfinite(worst.margin):
         return
     ax.axhline(worst.margin, color=PALE, lw=0.6, zorder=0)

@@ -19,12 +19,17 @@ import tomli_w
 from jinja2 import Environment, PackageLoader
 from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
-from wholearm_jax.core.status import Status
-from wholearm_jax.files.results import TRAJECTORY_COLUMNS, read_torque
-from wholearm_jax.files.scene_toml import Positive, SceneError, explain_validation_error, parse
-from wholearm_jax.model.contact_kinematics import contact_set, contact_kinematics
-from wholearm_jax.model.scene import COORDINATES, Scene, rigid_body, parse_contact
-from wholearm_jax.model.schedule import TorqueSchedule
+from wholearm_jax.core import Status
+from wholearm_jax.files import TRAJECTORY_COLUMNS, Positive, SceneError, explain_validation_error, parse, read_torque
+from wholearm_jax.model import (
+    COORDINATES,
+    Scene,
+    TorqueSchedule,
+    contact_kinematics,
+    contact_set,
+    parse_contact,
+    rigid_body,
+)
 from wholearm_jax.plotting.palette import (
     CONTACT_COLOURS,
     DARK_CONTACT_COLOURS,
@@ -182,7 +187,7 @@ def _places(scene: Scene, formation, z: np.ndarray) -> np.ndarray:
         found = contact_kinematics(several, z)
         return jax.numpy.stack([z[0] + found.from_object[0], z[1] + found.from_object[1], *found.normal], axis=1)
 
-    return np.asarray(at(z))[:, list(formation.normal_slots)]
+    return np.asarray(at(z))[:, list(formation.normal_rows)]
 
 
 def _columns(table: np.ndarray) -> dict[str, np.ndarray]:
@@ -203,7 +208,9 @@ def _read_summary(path: Path) -> dict[str, Any]:
     try:
         _Summary.model_validate(content)
     except ValidationError as error:
-        raise SceneError(f"{path}: {explain_validation_error(error)}; it is not a summary that this library wrote") from None
+        raise SceneError(
+            f"{path}: {explain_validation_error(error)}; it is not a summary that this library wrote"
+        ) from None
     return content
 
 
@@ -232,7 +239,7 @@ def _read_trajectory(path: Path, names: list[str]) -> dict[str, np.ndarray]:
 
 
 def _worst(summary: dict[str, Any]) -> dict[str, Any] | None:
-    """The phase whose margin is the plan's (as `Result.hardest`); None where one has no margin."""
+    """The phase whose margin is the plan's (as `Result.critical_phase`); None where one has no margin."""
     pairs = zip(summary["phases"], summary["scene"]["phase"], strict=True)
     rows = [row for row, phase in pairs if not phase.get("hold")] or summary["phases"]
     return None if any(row["margin"] is None for row in rows) else min(rows, key=lambda row: row["margin"])

@@ -8,60 +8,62 @@ import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
-from wholearm_jax.core.arrays import eps_power
-from wholearm_jax.dynamics.path_dynamics import PathDynamics, evaluate_dot, locate_panel
-from wholearm_jax.model.schedule import PhaseSchedule, torque_at
+from wholearm_jax.core import eps_power
+from wholearm_jax.dynamics import PathDynamics, evaluate_dot, locate_panel
+from wholearm_jax.model import PhaseSchedule, torque_at
 from wholearm_jax.simulation.integrator import IntegratorOptions, solver_of
 
 MAX_EVENT_ITERATIONS = 40  # at most so many Newton steps, or halvings, to the place where a stage ends
 
 
 @jax.jit
-def path_acceleration(table: PathDynamics, seen: PhaseSchedule, duration, piece, row, share, s, w):
+def path_acceleration(dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, segment, row, phase_time, s, w):
     """`dw/du` for forward travel in a piece and a torque interval."""
-    panel, xi = locate_panel(table, piece, s)
+    panel, xi = locate_panel(dynamics, segment, s)
     rest = jnp.stack([duration**2, w**2, duration * w])
-    terms = jnp.concatenate([rest, duration**2 * torque_at(seen, row, share)])
-    return evaluate_dot(table.acceleration, panel, xi, terms)
+    terms = jnp.concatenate([rest, duration**2 * torque_at(phase_schedule, row, phase_time)])
+    return evaluate_dot(dynamics.acceleration, panel, xi, terms)
 
 
 @jax.jit
-def solver_step(table, seen, duration, how: IntegratorOptions, piece, row, share, y, length):
+def solver_step(dynamics, phase_schedule, duration, options: IntegratorOptions, segment, row, phase_time, y, length):
     """One step of the solver from `y = (s, w)` at a share of the phase, within a piece and a torque interval."""
-    solver = solver_of(how)
+    solver = solver_of(options)
 
     def field(u, y, args):
-        table, seen, duration = args
-        return jnp.stack([y[1], path_acceleration(table, seen, duration, piece, row, u, y[0], y[1])])
+        dynamics, phase_schedule, duration = args
+        return jnp.stack([y[1], path_acceleration(dynamics, phase_schedule, duration, segment, row, u, y[0], y[1])])
 
-    term, args = dfx.ODETerm(field), (table, seen, duration)
-    state = solver.init(term, share, share + length, y, args)
-    return solver.step(term, share, share + length, y, args, state, made_jump=True)[0]
+    term, args = dfx.ODETerm(field), (dynamics, phase_schedule, duration)
+    state = solver.init(term, phase_time, phase_time + length, y, args)
+    return solver.step(term, phase_time, phase_time + length, y, args, state, made_jump=True)[0]
 
 
-def step_to_event(table, seen, duration, how, piece, row, node, end, goal, floor, wanted):
+def step_to_event(dynamics, phase_schedule, duration, options, segment, row, node, end, s_stop, w_stop, wanted):
     """Retake the last step from `node` with the length that lands on `s = goal` or on `w = 0`, whichever comes first.
 
     Returns where it lands, whether on the goal, and whether it went astray: no length within the step lands there.
     """
-    share, s, w = node
-    longest = jnp.where(wanted, end - share, 0.0)
+    phase_time, s, w = node
+    longest = jnp.where(wanted, end - phase_time, 0.0)
 
-    def field(share, y, args):
-        table, seen, duration = args
-        return jnp.stack([y[1], path_acceleration(table, seen, duration, piece, row, share, y[0], y[1])])
+    def field(phase_time, y, args):
+        dynamics, phase_schedule, duration = args
+        return jnp.stack(
+            [y[1], path_acceleration(dynamics, phase_schedule, duration, segment, row, phase_time, y[0], y[1])]
+        )
 
-    def step(share, length, y, args):
-        table, seen, duration = args
-        return solver_step(table, seen, duration, how, piece, row, share, y, length)
+    def step(phase_time, length, y, args):
+        dynamics, phase_schedule, duration = args
+        return solver_step(dynamics, phase_schedule, duration, options, segment, row, phase_time, y, length)
 
-    args = (table, seen, duration)
-    fixed = stop_gradient((share, jnp.stack([s, w]), args, longest))
-    goal_now = stop_gradient(goal)
+    args = (dynamics, phase_schedule, duration)
+    fixed = stop_gradient((phase_time, jnp.stack([s, w]), args, longest))
+    goal_now = stop_gradient(s_stop)
 
     def beyond(y):
         """Whether the goal is passed by more than the speed has fallen below rest, and by how much."""
-        passing, resting = y[0] - goal_now, floor - y[1]
+        passing, resting = y[0] - goal_now, w_stop - y[1]
         return passing >= resting, jnp.maximum(passing, resting)
 
     def narrow(bracket):
@@ -84,22 +86,22 @@ def step_to_event(table, seen, duration, how, piece, row, node, end, goal, floor
     enough = eps_power(s, 5 / 8) * fixed[3]
     begin = (jnp.zeros_like(fixed[3]), fixed[3], fixed[3] / 2, fixed[3], jnp.asarray(0, int))
     length = jax.lax.while_loop(going, narrow, begin)[2]
-    y = step(share, length, jnp.stack([s, w]), args)
-    rate = stop_gradient(field(share + length, y, args))
+    y = step(phase_time, length, jnp.stack([s, w]), args)
+    rate = stop_gradient(field(phase_time + length, y, args))
     # An object that comes to rest just at the goal does both: it lands on the one that is nearer in time.
-    targets = jnp.stack([jnp.where(jnp.isfinite(goal), goal, 0.0), jnp.zeros_like(goal)])
+    targets = jnp.stack([jnp.where(jnp.isfinite(s_stop), s_stop, 0.0), jnp.zeros_like(s_stop)])
     lates = (targets - y) / jnp.where(wanted & (rate != 0), rate, 1.0)
-    possible = jnp.stack([jnp.isfinite(goal) & (rate[0] > 0), jnp.isfinite(floor) & (rate[1] < 0)])
+    possible = jnp.stack([jnp.isfinite(s_stop) & (rate[0] > 0), jnp.isfinite(w_stop) & (rate[1] < 0)])
     which = jnp.argmin(jnp.where(possible, jnp.abs(stop_gradient(lates)), jnp.inf))
     passed = wanted & (which == 0)
     late = jnp.where(wanted, lates[which], 0.0)
-    astray = wanted & ~(jnp.abs(late) <= longest)
-    late = jnp.where(astray, 0.0, late)
+    failed = wanted & ~(jnp.abs(late) <= longest)
+    late = jnp.where(failed, 0.0, late)
     y = y + rate * late
     return (
-        share + length + late,
+        phase_time + length + late,
         jnp.where(passed, targets[0], y[0]),
         jnp.where(passed, y[1], 0.0),
         passed,
-        astray,
+        failed,
     )

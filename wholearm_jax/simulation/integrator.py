@@ -18,9 +18,8 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.arrays import as_strong_array
-from wholearm_jax.core.lookup import take_row
-from wholearm_jax.model.schedule import PhaseSchedule, interval, round_up
+from wholearm_jax.core import as_strong_array, take_row
+from wholearm_jax.model import PhaseSchedule, interval, round_up
 
 LoopKind = Literal["lax", "bounded"]
 LOOP_KIND: dict[str, LoopKind] = {"none": "lax", "forward": "lax", "reverse": "bounded", "both": "bounded"}
@@ -41,20 +40,20 @@ class IntegratorOptions(eqx.Module):
     solver: dfx.AbstractSolver = eqx.field(static=True, default=dfx.Dopri8())
     tolerance: float | Float[Array, ""] = 1e-10
     max_steps: int = eqx.field(static=True, default=256)
-    stages: int = eqx.field(static=True, default=8)
-    steps: bool = eqx.field(static=True, default=False)
+    max_stages: int = eqx.field(static=True, default=8)
+    has_jumps: bool = eqx.field(static=True, default=False)
     adjoint: str = eqx.field(static=True, default="none")
 
 
-def tolerance_as_data(how: IntegratorOptions, dtype) -> IntegratorOptions:
+def tolerance_as_data(options: IntegratorOptions, dtype) -> IntegratorOptions:
     """The same integration, with a tolerance that is an array: all tolerances share a program."""
-    tolerance = as_strong_array(how.tolerance, dtype)
-    return how if tolerance is how.tolerance else replace(how, tolerance=tolerance)
+    tolerance = as_strong_array(options.tolerance, dtype)
+    return options if tolerance is options.tolerance else replace(options, tolerance=tolerance)
 
 
-def with_step_capacity(how: IntegratorOptions, rows: int) -> IntegratorOptions:
+def with_step_capacity(options: IntegratorOptions, rows: int) -> IntegratorOptions:
     """The same integration with room for a step at each of so many rows of a schedule, and for as many more."""
-    return replace(how, max_steps=round_up(2 * max(rows, 1), how.max_steps))
+    return replace(options, max_steps=round_up(2 * max(rows, 1), options.max_steps))
 
 
 class AcceptedSteps(NamedTuple):
@@ -94,7 +93,16 @@ class TerminalEvent(NamedTuple):
     between: Callable
 
 
-def integrate_adaptive(field: Callable, seen: PhaseSchedule, how: IntegratorOptions, begin, final, y, stop: TerminalEvent, way: Float[Array, ""]) -> AcceptedSteps:
+def integrate_adaptive(
+    field: Callable,
+    phase_schedule: PhaseSchedule,
+    options: IntegratorOptions,
+    begin,
+    final,
+    y,
+    stop: TerminalEvent,
+    way: Float[Array, ""],
+) -> AcceptedSteps:
     """Steps by their error from `begin` to `final`, or to the first that comes past its `stop`; each ends at a knot at
     most.
 
@@ -102,15 +110,17 @@ def integrate_adaptive(field: Callable, seen: PhaseSchedule, how: IntegratorOpti
     `way` at the speed there, if that is shorter. A step that may have been beyond the stop between its ends is taken
     again by halves.
     """
-    errors = dfx.PIDController(rtol=how.tolerance, atol=how.tolerance)
-    solver, term = _with_stages(how.solver, "lax"), dfx.ODETerm(field)
+    errors = dfx.PIDController(rtol=options.tolerance, atol=options.tolerance)
+    solver, term = _with_stages(options.solver, "lax"), dfx.ODETerm(field)
     order = solver.error_order(term)
     assert order is not None  # that of a stochastic solver may be
     eps = jnp.finfo(y.dtype).eps
 
     def cut(begin, size, number):
         """Where a step ends: on the interval's end, rather than next to it or beyond."""
-        knot = jnp.minimum(jnp.where(number < seen.last, take_row(seen.share, number + 1), final), final)
+        knot = jnp.minimum(
+            jnp.where(number < phase_schedule.last, take_row(phase_schedule.phase_time, number + 1), final), final
+        )
         return jnp.where(begin + size > knot - 100 * eps, knot, begin + size)
 
     def attempt(at: _IntegratorState) -> _IntegratorState:
@@ -124,8 +134,8 @@ def integrate_adaptive(field: Callable, seen: PhaseSchedule, how: IntegratorOpti
         begin, end, control = jax.tree.map(lambda a, b: jnp.where(halved, a, b), shorter, (*span, control))
         # What a knot cut short says nothing against the length that was meant.
         size = jnp.where(kept, jnp.maximum(end - begin, at.size), end - begin)
-        row = interval(seen, begin)
-        place = jnp.where(kept, at.steps.count, how.max_steps)
+        row = interval(phase_schedule, begin)
+        place = jnp.where(kept, at.steps.count, options.max_steps)
         steps = at.steps._replace(
             end=at.steps.end.at[place].set(at.end, mode="drop"),
             row=at.steps.row.at[place].set(at.row, mode="drop"),
@@ -134,26 +144,28 @@ def integrate_adaptive(field: Callable, seen: PhaseSchedule, how: IntegratorOpti
             passed=kept & stop.past(y),
         )
         y, reused = jax.tree.map(lambda new, old: jnp.where(kept, new, old), (y, reused), (at.y, at.reused))
-        jumped = jnp.where(kept, row != at.row, at.jumped) if how.steps else False
-        return _IntegratorState(begin, cut(begin, size, row), size, row, y, jumped, reused, control, at.tries + 1, steps)
+        jumped = jnp.where(kept, row != at.row, at.jumped) if options.has_jumps else False
+        return _IntegratorState(
+            begin, cut(begin, size, row), size, row, y, jumped, reused, control, at.tries + 1, steps
+        )
 
     def going(at: _IntegratorState):
-        return (at.begin < final) & ~at.steps.passed & (at.tries < how.max_steps)
+        return (at.begin < final) & ~at.steps.passed & (at.tries < options.max_steps)
 
     half = jnp.where(y[1] > 0, way / jnp.where(y[1] > 0, 2 * y[1], 1.0), 1.0)
-    size, row = jnp.clip(half, eps, 1 / 32), interval(seen, begin)
+    size, row = jnp.clip(half, eps, 1 / 32), interval(phase_schedule, begin)
     end = cut(begin, size, row)
     none = AcceptedSteps(
-        end=jnp.full(how.max_steps, begin),
-        row=jnp.zeros(how.max_steps, int),
-        y=jnp.broadcast_to(y, (how.max_steps, 2)),
+        end=jnp.full(options.max_steps, begin),
+        row=jnp.zeros(options.max_steps, int),
+        y=jnp.broadcast_to(y, (options.max_steps, 2)),
         count=jnp.asarray(0, int),
         passed=jnp.asarray(False),
         complete=jnp.asarray(False),
     )
     reused = solver.init(term, begin, end, y, row)
     _, control = errors.init(term, begin, final, y, size, row, solver.func, order)
-    jumped = jnp.asarray(False) if how.steps else False
+    jumped = jnp.asarray(False) if options.has_jumps else False
     start = _IntegratorState(begin, end, size, row, y, jumped, reused, control, jnp.asarray(0, int), none)
     last = jax.lax.while_loop(going, attempt, start)
     return last.steps._replace(complete=(last.begin >= final) | last.steps.passed)
@@ -167,48 +179,56 @@ def _end_rates(solver: dfx.AbstractSolver, field: Callable, at: _IntegratorState
     return tuple((at.end - at.begin) * rate for rate in ends)
 
 
-def replay_steps(field: Callable, seen: PhaseSchedule, how: IntegratorOptions, begin, final, y, steps: AcceptedSteps) -> AcceptedSteps:
+def replay_steps(
+    field: Callable, phase_schedule: PhaseSchedule, options: IntegratorOptions, begin, final, y, steps: AcceptedSteps
+) -> AcceptedSteps:
     """Steps that were `integrate_adaptive`, taken again; those that end on a knot move with it."""
     count, row = steps.count, steps.row
-    ends = _step_ends(seen, steps, final)
+    ends = _step_ends(phase_schedule, steps, final)
     # A batch goes on until its last member has finished: the others take steps of no length.
-    ends = jnp.where(jnp.arange(how.max_steps) < count, ends, ends[jnp.maximum(count - 1, 0)])
+    ends = jnp.where(jnp.arange(options.max_steps) < count, ends, ends[jnp.maximum(count - 1, 0)])
     ends = jnp.where(count > 0, ends, begin)
     begins = jnp.concatenate([begin[None], ends[:-1]])
-    kind = LOOP_KIND[how.adjoint]
-    solver, term = _with_stages(how.solver, kind), dfx.ODETerm(field)
+    kind = LOOP_KIND[options.adjoint]
+    solver, term = _with_stages(options.solver, kind), dfx.ODETerm(field)
     jumps = jnp.append(False, row[1:] != row[:-1])
 
     def step(at):
         k, y, reused, ys = at
-        jumped = take_row(jumps, k) if how.steps else False
-        y, _, _, reused, _ = solver.step(term, take_row(begins, k), take_row(ends, k), y, take_row(row, k), reused, jumped)
+        jumped = take_row(jumps, k) if options.has_jumps else False
+        y, _, _, reused, _ = solver.step(
+            term, take_row(begins, k), take_row(ends, k), y, take_row(row, k), reused, jumped
+        )
         return k + 1, y, reused, ys.at[k].set(y)
 
     rows = jnp.zeros_like(steps.y)  # not `y`: what a row of a buffer holds before it is written keeps its derivative
     start = jnp.asarray(0, int), y, solver.init(term, begin, ends[0], y, row[0]), rows
     *_, ys = eqxi.while_loop(
-        lambda at: at[0] < count, step, start, max_steps=how.max_steps, buffers=lambda at: at[3], kind=kind
+        lambda at: at[0] < count, step, start, max_steps=options.max_steps, buffers=lambda at: at[3], kind=kind
     )
     return steps._replace(end=ends, y=ys)
 
 
-def _step_ends(seen: PhaseSchedule, steps: AcceptedSteps, final):
+def _step_ends(phase_schedule: PhaseSchedule, steps: AcceptedSteps, final):
     """When steps end: on a knot, or at a time of their own."""
-    knot = seen.share[steps.row + 1]
+    knot = phase_schedule.phase_time[steps.row + 1]
     return jnp.where((steps.end == stop_gradient(knot)) & (steps.end < final), knot, stop_gradient(steps.end))
 
 
 @eqx.filter_custom_vjp
-def integrate_with_replay_adjoint(inputs, field_of: Callable, stop_of: Callable, how: IntegratorOptions, final, limits, way) -> AcceptedSteps:
+def integrate_with_replay_adjoint(
+    inputs, field_of: Callable, stop_of: Callable, options: IntegratorOptions, final, limits, way
+) -> AcceptedSteps:
     """`integrate_adaptive`, of `field_of(parameters, seen)` until `stop_of(limits)`, whose reverse mode goes back over its own
     steps.
 
     `inputs` are `(parameters, seen, begin, y)`, what it can be differentiated by. Each step is computed once more on
     the way back, from where it began, and none on the way there.
     """
-    parameters, seen, begin, y = inputs
-    return integrate_adaptive(field_of(parameters, seen), seen, how, begin, final, y, stop_of(limits), way)
+    parameters, phase_schedule, begin, y = inputs
+    return integrate_adaptive(
+        field_of(parameters, phase_schedule), phase_schedule, options, begin, final, y, stop_of(limits), way
+    )
 
 
 @integrate_with_replay_adjoint.def_fwd
@@ -219,10 +239,12 @@ def _replay_forward(_, inputs, *others):
 
 
 @integrate_with_replay_adjoint.def_bwd
-def _replay_backward(steps: AcceptedSteps, gradient: AcceptedSteps, perturbed, inputs, field_of, stop_of, how, final, limits, way):
-    parameters, seen, begin, y = inputs
-    moved, kept = eqx.partition((parameters, seen, begin), perturbed[:3])
-    solver = solver_of(how)
+def _replay_backward(
+    steps: AcceptedSteps, gradient: AcceptedSteps, perturbed, inputs, field_of, stop_of, options, final, limits, way
+):
+    parameters, phase_schedule, begin, y = inputs
+    moved, kept = eqx.partition((parameters, phase_schedule, begin), perturbed[:3])
+    solver = solver_of(options)
     ys = jnp.concatenate([y[None], steps.y[:-1]])
     onto_end, onto_y = (
         jnp.zeros_like(value) if slope is None else slope
@@ -230,18 +252,18 @@ def _replay_backward(steps: AcceptedSteps, gradient: AcceptedSteps, perturbed, i
     )
 
     def step(moved, y, k):
-        parameters, seen, begin = eqx.combine(moved, kept)
-        ends = _step_ends(seen, steps, final)
+        parameters, phase_schedule, begin = eqx.combine(moved, kept)
+        ends = _step_ends(phase_schedule, steps, final)
         begin = jnp.where(k > 0, take_row(ends, jnp.maximum(k - 1, 0)), begin)
-        term, end, row = dfx.ODETerm(field_of(parameters, seen)), take_row(ends, k), take_row(steps.row, k)
+        term, end, row = dfx.ODETerm(field_of(parameters, phase_schedule)), take_row(ends, k), take_row(steps.row, k)
         reused = solver.init(term, begin, end, y, row)
         return end, solver.step(term, begin, end, y, row, reused, made_jump=False)[0]
 
     def before(at):
         k, onto, total = at
         _, pull = jax.vjp(lambda moved, y: step(moved, y, k), moved, take_row(ys, k))
-        share, onto = pull((take_row(onto_end, k), onto + take_row(onto_y, k)))
-        return k - 1, onto, jax.tree.map(jnp.add, total, share)
+        phase_time, onto = pull((take_row(onto_end, k), onto + take_row(onto_y, k)))
+        return k - 1, onto, jax.tree.map(jnp.add, total, phase_time)
 
     none = jax.tree.map(jnp.zeros_like, moved)
     start = steps.count - 1, jnp.zeros_like(y), none
@@ -249,9 +271,9 @@ def _replay_backward(steps: AcceptedSteps, gradient: AcceptedSteps, perturbed, i
     return *total, onto
 
 
-def solver_of(how: IntegratorOptions) -> dfx.AbstractSolver:
+def solver_of(options: IntegratorOptions) -> dfx.AbstractSolver:
     """The solver, with a loop over its stages that may be differentiated as `how` says."""
-    return _with_stages(how.solver, LOOP_KIND[how.adjoint])
+    return _with_stages(options.solver, LOOP_KIND[options.adjoint])
 
 
 def _with_stages(solver: dfx.AbstractSolver, kind: LoopKind) -> dfx.AbstractSolver:

@@ -15,30 +15,25 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core.arrays import eps_power
-from wholearm_jax.core.lookup import set_row
-from wholearm_jax.core.small_linalg import null_vector, inverse_and_determinant, fused_matmul
-from wholearm_jax.core.status import Status
-from wholearm_jax.model.contact_kinematics import constraint_jacobian, constraints, slip_velocity
-from wholearm_jax.model.mechanics import ScaledMechanics
-from wholearm_jax.model.scene import PathTarget
+from wholearm_jax.core import Status, eps_power, fused_matmul, inverse_and_determinant, null_vector, set_row
+from wholearm_jax.model import PathTarget, ScaledMechanics, constraint_jacobian, constraints, slip_velocity
 from wholearm_jax.tracing.events import EventFunctions, EventValues, detect_events, event_functions
 
 MAX_CONTINUATION_STEP, BRACKET_STEP = 0.06, 2e-3  # march steps, and the step at which an end counts as bracketed
 MAX_CHARTS = 8  # directions that a wire may be charted by, one after the other
 
 
-def oriented_tangent(system: ScaledMechanics, z, hint):
+def oriented_tangent(mechanics: ScaledMechanics, z, hint):
     """The unit tangent `x` on the side of `hint`, and `det [G; x]`: the product of singular values, which changes sign
     where wires meet."""
-    across = null_vector(constraint_jacobian(system.contacts, z))
+    across = null_vector(constraint_jacobian(mechanics.contacts, z))
     size = jnp.sqrt((across**2).sum()) * jnp.where(across @ hint < 0, -1.0, 1.0)
     return across / size, size
 
 
-def reversal_functions(system: ScaledMechanics, z, x):
+def reversal_functions(mechanics: ScaledMechanics, z, x):
     """What reverses at kinks: the slips of the contacts and the joints' speeds."""
-    return jnp.concatenate([slip_velocity(system.contacts, z, x), x[3:]])
+    return jnp.concatenate([slip_velocity(mechanics.contacts, z, x), x[3:]])
 
 
 def sign_with_deadband(values, tolerance):
@@ -49,15 +44,15 @@ def sign_with_deadband(values, tolerance):
 class Node(NamedTuple):
     """A place on the way: `z`, its tangent `x`, where along the wire, and the number of the chart that led to it.
 
-    `orientation` is `det [G; x]`; `flips` says what reverses or turns on the way to it from the node before
-    (`reversal_functions`, then the chart), at what `share` of that way.
+    `orientation` is `det [G; x]`; `sign_changed` says what reverses or turns on the way to it from the node before
+    (`reversal_functions`, then the chart), at what `change_fraction` of that way.
     """
 
     z: Float[Array, "*nodes 5"]
     x: Float[Array, "*nodes 5"]
     s: Float[Array, "*nodes"]
-    flips: Bool[Array, "*nodes 7"]
-    share: Float[Array, "*nodes 7"]
+    sign_changed: Bool[Array, "*nodes 7"]
+    change_fraction: Float[Array, "*nodes 7"]
     orientation: Float[Array, "*nodes"]
     chart: Int[Array, "*nodes"]
 
@@ -113,24 +108,26 @@ class _ContinuationState(NamedTuple):
     done: Bool[Array, ""]
 
 
-def trace_curve(system: ScaledMechanics, heading: PathTarget, z: Float[Array, "5"], x: Float[Array, "5"], capacity: int) -> TracedCurve:
+def trace_curve(
+    mechanics: ScaledMechanics, target: PathTarget, z: Float[Array, "5"], x: Float[Array, "5"], capacity: int
+) -> TracedCurve:
     """Follow a wire from `z` along its unit tangent `x` to its end: `max_steps` if `capacity` nodes do not reach it."""
-    watch, tolerance = event_functions(system, heading, z), eps_power(z, 5 / 8)
+    events, tolerance = event_functions(mechanics, target, z), eps_power(z, 5 / 8)
 
     def step(way: _ContinuationState) -> _ContinuationState:
-        return _step(system, watch, tolerance, capacity, way)
+        return _step(mechanics, events, tolerance, capacity, way)
 
-    way = jax.lax.while_loop(lambda way: ~way.done, step, _initial_state(z, x, watch, capacity))
-    return _bracket_end(watch, way, tolerance)
+    way = jax.lax.while_loop(lambda way: ~way.done, step, _initial_state(z, x, events, capacity))
+    return _bracket_end(events, way, tolerance)
 
 
-def _initial_state(z, x, watch: EventFunctions, capacity: int) -> _ContinuationState:
+def _initial_state(z, x, events: EventFunctions, capacity: int) -> _ContinuationState:
     """A march that has no node yet. Its first step has no length: it looks about at the start."""
 
     def rows(number, row):
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (number, *a.shape)), row)
 
-    zero, whole, none, still = jnp.zeros((), z.dtype), jnp.asarray(0, int), jnp.zeros(6, z.dtype), 0 * watch.shift
+    zero, whole, none, still = jnp.zeros((), z.dtype), jnp.asarray(0, int), jnp.zeros(6, z.dtype), 0 * events.shift
     nothing = EventValues(still - jnp.inf, still, still)
     start = Node(z, x, zero, jnp.zeros(7, bool), jnp.zeros(7, z.dtype), zero, whole)
     chart = Chart(x, z, zero)
@@ -154,22 +151,24 @@ def _initial_state(z, x, watch: EventFunctions, capacity: int) -> _ContinuationS
     )
 
 
-def _step(system: ScaledMechanics, watch: EventFunctions, tolerance, capacity: int, way: _ContinuationState) -> _ContinuationState:
+def _step(
+    mechanics: ScaledMechanics, events: EventFunctions, tolerance, capacity: int, way: _ContinuationState
+) -> _ContinuationState:
     """Try one step: keep its node, take a shorter one, or find that the wire ends within the shortest."""
     last, u = way.last, way.chart.direction
     height = u @ last.z + way.step
-    z, moved, inverted, determinant = newton_corrector(system, u, _hermite_predictor(way), height, 4, tolerance)
+    z, moved, inverted, determinant = newton_corrector(mechanics, u, _hermite_predictor(way), height, 4, tolerance)
     size = jnp.sqrt((inverted[:, 4] ** 2).sum())
     x, orientation = inverted[:, 4] / size, determinant * size  # u = x / size + what the rows of G span
-    watched = watch.at(z, x / (u @ x))
+    event_values = events.at(z, x / (u @ x))
     good = (moved < tolerance) & (x @ last.x > 0.98) & jnp.all(jnp.isfinite(x))
-    crossed, where = detect_events(watch, way.before, watched, way.step, tolerance)
+    crossed, where = detect_events(events, way.before, event_values, way.step, tolerance)
     ends = good & jnp.any(crossed)
     bracketed = ends & (way.step <= BRACKET_STEP)
     accept = good & ~jnp.any(crossed)
     turn = accept & (u @ x < 0.6)
     number = way.number + turn
-    speeds = reversal_functions(system, z, x)
+    speeds = reversal_functions(mechanics, z, x)
     sign = sign_with_deadband(speeds, tolerance)
     flips = sign * way.sense < 0
     share = jnp.where(flips, jnp.clip(way.speeds / jnp.where(flips, way.speeds - speeds, 1.0), 0.0, 1.0), 0.0)
@@ -182,7 +181,7 @@ def _step(system: ScaledMechanics, watch: EventFunctions, tolerance, capacity: i
     longer = jnp.where(way.n > 0, jnp.minimum(way.step * 1.5, MAX_CONTINUATION_STEP), MAX_CONTINUATION_STEP)
     lost = ~good & (way.step < 1e-6)
     full = (way.n + 1 >= capacity) | (number >= MAX_CHARTS)
-    in_chart = watched._replace(rates=watched.rates * jnp.where(turn, u @ x, 1.0))
+    in_chart = event_values._replace(rates=event_values.rates * jnp.where(turn, u @ x, 1.0))
 
     def kept(wanted, new, old):
         return jax.tree.map(lambda a, b: jnp.where(wanted, a, b), new, old)
@@ -200,7 +199,7 @@ def _step(system: ScaledMechanics, watch: EventFunctions, tolerance, capacity: i
         speeds=jnp.where(accept, speeds, way.speeds),
         sense=jnp.where(accept & (sign != 0), sign, way.sense),
         before=kept(accept, in_chart, way.before),
-        beyond=watched,
+        beyond=event_values,
         tried=tried,
         status=jnp.select([lost, full & ~bracketed], [int(Status.SINGULAR), int(Status.MAX_STEPS)], 0),
         done=bracketed | lost | full,
@@ -218,11 +217,11 @@ def _hermite_predictor(way: _ContinuationState):
     return last.z + way.step * (slope + bend * t)
 
 
-def _bracket_end(watch: EventFunctions, way: _ContinuationState, tolerance) -> TracedCurve:
+def _bracket_end(events: EventFunctions, way: _ContinuationState, tolerance) -> TracedCurve:
     """What ends the wire first between the last node within it and the last that was tried, and about where."""
     last, tried = way.last, way.tried
     step = jnp.where(way.status == 0, tried.s - last.s, 1.0)
-    crossed, where = detect_events(watch, way.before, way.beyond, step, tolerance)
+    crossed, where = detect_events(events, way.before, way.beyond, step, tolerance)
     first = jnp.argmin(jnp.where(crossed, where, jnp.inf))
     found = (way.status == 0) & jnp.any(crossed)
     start = way.nodes.z[0]
@@ -236,7 +235,7 @@ def _bracket_end(watch: EventFunctions, way: _ContinuationState, tolerance) -> T
     )
 
 
-def newton_corrector(system: ScaledMechanics, u, z, height, steps: int, enough: ArrayLike = 0.0):
+def newton_corrector(mechanics: ScaledMechanics, u, z, height, steps: int, enough: ArrayLike = 0.0):
     """Newton in the chart, until a step is no larger than `enough`: the place of the wire on the plane `u.z = height`.
 
     Beside it the last step's size, and `[G; u]^-1` and its determinant before that step.
@@ -244,8 +243,10 @@ def newton_corrector(system: ScaledMechanics, u, z, height, steps: int, enough: 
 
     def once(state):
         z, count, *_ = state
-        inverted, determinant = inverse_and_determinant(jnp.concatenate([constraint_jacobian(system.contacts, z), u[None]]))
-        left = jnp.concatenate([constraints(system.contacts, z), (u @ z - height)[None]])
+        inverted, determinant = inverse_and_determinant(
+            jnp.concatenate([constraint_jacobian(mechanics.contacts, z), u[None]])
+        )
+        left = jnp.concatenate([constraints(mechanics.contacts, z), (u @ z - height)[None]])
         move = fused_matmul(inverted, left)
         return z - move, count + 1, jnp.abs(move).max(), inverted, determinant
 

@@ -17,9 +17,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.model.contact_kinematics import ContactSet, feature_velocity, contact_kinematics, gap_velocity
-from wholearm_jax.model.mechanics import ScaledMechanics
-from wholearm_jax.model.scene import PathTarget
+from wholearm_jax.model import (
+    ContactSet,
+    PathTarget,
+    ScaledMechanics,
+    contact_kinematics,
+    feature_velocity,
+    gap_velocity,
+)
 
 
 class EventValues(NamedTuple):
@@ -35,7 +40,7 @@ class EventFunctions(NamedTuple):
     feature, and a coordinate's limit.
 
     `gap`, `along`, `limit` and `shift` are the weights of a row's value. A pair ends the wire within `[lower, upper]`
-    of its feature, and if it `counts`; `behind` marks vertices that may lie behind a link.
+    of its feature, and if it `is_terminal`; `may_start_negative` marks vertices that may lie behind a link.
     """
 
     contacts: ContactSet
@@ -46,8 +51,8 @@ class EventFunctions(NamedTuple):
     coordinate: Int[Array, ""]
     lower: Float[Array, "rows"]
     upper: Float[Array, "rows"]
-    counts: Bool[Array, "rows"]
-    behind: Bool[Array, "rows"]
+    is_terminal: Bool[Array, "rows"]
+    may_start_negative: Bool[Array, "rows"]
 
     def at(self, z: Float[Array, "5"], slope: Float[Array, "5"]) -> EventValues:
         """What is watched at a place of the wire, where `z` changes by `slope` a unit of `s`."""
@@ -61,10 +66,10 @@ class EventFunctions(NamedTuple):
         )
 
 
-def event_functions(system: ScaledMechanics, heading: PathTarget, z: Float[Array, "5"]) -> EventFunctions:
+def event_functions(mechanics: ScaledMechanics, target: PathTarget, z: Float[Array, "5"]) -> EventFunctions:
     """What is watched on a formation's wire from `z` on."""
-    pairs, held, until = system.candidates, system.contacts, heading.until_coordinate >= 0
-    sense = jnp.where(heading.until_value < z[heading.until_coordinate], -1.0, 1.0)
+    pairs, held, until = mechanics.candidates, mechanics.contacts, target.until_coordinate >= 0
+    sense = jnp.where(target.until_value < z[target.until_coordinate], -1.0, 1.0)
     one, none, far = jnp.ones_like(held.lower), jnp.zeros_like(held.lower), jnp.full_like(held.lower, jnp.inf)
     every, nothing = jnp.ones_like(pairs.lower), jnp.zeros_like(pairs.lower)
 
@@ -76,23 +81,23 @@ def event_functions(system: ScaledMechanics, heading: PathTarget, z: Float[Array
         gap=rows(every, none, none, 0.0),
         along=rows(nothing, one, -one, 0.0),
         limit=rows(nothing, none, none, jnp.where(until, -sense, 0.0)),
-        shift=rows(nothing, -held.lower, held.upper, jnp.where(until, sense * heading.until_value, 1.0)),
-        coordinate=heading.until_coordinate,
+        shift=rows(nothing, -held.lower, held.upper, jnp.where(until, sense * target.until_value, 1.0)),
+        coordinate=target.until_coordinate,
         lower=rows(pairs.lower, -far, -far, -jnp.inf),
         upper=rows(pairs.upper, far, far, jnp.inf),
-        counts=rows(system.watched, one > 0, one > 0, True),
-        behind=rows(system.behind, one < 0, one < 0, False),
+        is_terminal=rows(mechanics.may_terminate, one > 0, one > 0, True),
+        may_start_negative=rows(mechanics.may_be_behind, one < 0, one < 0, False),
     )
 
 
-def detect_events(watch: EventFunctions, before: EventValues, after: EventValues, step, tolerance):
+def detect_events(events: EventFunctions, before: EventValues, after: EventValues, step, tolerance):
     """Which watched values turn negative within a step (or dip below zero and return), and at what share of it.
 
     The share is a root of the cubic through values and rates: several things that end a wire within the shortest step
     are told apart to 1e-13.
     """
     # A vertex behind a link, within its length, stops at its back; one misplaced there comes out.
-    sense = jnp.where((before.values < -tolerance) & watch.behind, -1.0, 1.0)
+    sense = jnp.where((before.values < -tolerance) & events.may_start_negative, -1.0, 1.0)
     old, new, leaving, arriving = sense * before.values, sense * after.values, sense * before.rates, sense * after.rates
     # From either side what is within the tolerance counts as in front.
     through = (old >= -tolerance) & (new < -sense * tolerance)
@@ -114,7 +119,7 @@ def detect_events(watch: EventFunctions, before: EventValues, after: EventValues
             better = where - (old + where * (low + where * (square + where * cube))) / jnp.where(rate < 0, rate, -1.0)
             where = jnp.where((rate < 0) & (better >= 0) & (better <= 1), better, where)
         at = before.along + (after.along - before.along) * where
-        inside = (at >= watch.lower - tolerance) & (at <= watch.upper + tolerance)
-        return (through | dips) & inside & watch.counts, where
+        inside = (at >= events.lower - tolerance) & (at <= events.upper + tolerance)
+        return (through | dips) & inside & events.is_terminal, where
 
     return jax.lax.cond(jnp.any(through | dips), placed, lambda: (through & dips, jnp.zeros_like(old)))

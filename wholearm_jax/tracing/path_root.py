@@ -21,10 +21,14 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core.arrays import eps_power
-from wholearm_jax.core.small_linalg import inverse_and_determinant, fused_matmul
-from wholearm_jax.model.contact_kinematics import constraint_second_derivative, constraint_velocity, constraint_jacobian, constraints
-from wholearm_jax.model.mechanics import ScaledMechanics
+from wholearm_jax.core import eps_power, fused_matmul, inverse_and_determinant
+from wholearm_jax.model import (
+    ScaledMechanics,
+    constraint_jacobian,
+    constraint_second_derivative,
+    constraint_velocity,
+    constraints,
+)
 
 
 class PathRoot(NamedTuple):
@@ -39,22 +43,24 @@ class PathRoot(NamedTuple):
 class LocalPath(NamedTuple):
     """A wire at one place, in the chart with direction `u`: `K`, `x = dz/ds`, `x' = d2z/ds2` and `det [G; u]`."""
 
-    back: Float[Array, "5 slots"]
+    constraint_inverse: Float[Array, "5 rows"]
     x: Float[Array, "5"]
-    bend: Float[Array, "5"]
+    curvature: Float[Array, "5"]
     determinant: Float[Array, ""]
 
 
-def path_derivatives(system: ScaledMechanics, z: Float[Array, "5"], u: Float[Array, "5"]) -> LocalPath:
+def path_derivatives(mechanics: ScaledMechanics, z: Float[Array, "5"], u: Float[Array, "5"]) -> LocalPath:
     """What a wire does at `z`: `G x = 0`, `u.x = 1`, `G x' = -x^T H x`, `u.x' = 0`."""
-    inverted, determinant = inverse_and_determinant(jnp.concatenate([constraint_jacobian(system.contacts, z), u[None]]))
+    inverted, determinant = inverse_and_determinant(
+        jnp.concatenate([constraint_jacobian(mechanics.contacts, z), u[None]])
+    )
     back, x = inverted[:, :4], inverted[:, 4]
-    return LocalPath(back, x, -fused_matmul(back, constraint_second_derivative(system.contacts, z, x)), determinant)
+    return LocalPath(back, x, -fused_matmul(back, constraint_second_derivative(mechanics.contacts, z, x)), determinant)
 
 
 def solve_on_path(
     function: Callable,
-    system: ScaledMechanics,
+    mechanics: ScaledMechanics,
     z: Float[Array, "5"],
     u: Float[Array, "5"],
     *parameters,
@@ -66,14 +72,14 @@ def solve_on_path(
     `u.x = 1`; each step is no longer than `longest`. A root that was not found shows in `residual`, never as NaN or an
     exception.
     """
-    fixed, settings, u = stop_gradient((system, parameters, u))
+    fixed, settings, u = stop_gradient((mechanics, parameters, u))
 
     def step(state):
         z, _, _, _, count, _ = state
         at = path_derivatives(fixed, z, u)
-        value, rate = jax.jvp(lambda z, x: function(fixed, z, x, *settings), (z, at.x), (at.x, at.bend))
+        value, rate = jax.jvp(lambda z, x: function(fixed, z, x, *settings), (z, at.x), (at.x, at.curvature))
         left = constraints(fixed.contacts, z)
-        move = -fused_matmul(at.back, left) - at.x * jnp.where(count > 0, value / rate, 0.0)
+        move = -fused_matmul(at.constraint_inverse, left) - at.x * jnp.where(count > 0, value / rate, 0.0)
         move = jnp.where(jnp.isfinite(move), move, 0.0)
         size = jnp.abs(move).max()
         move = move * jnp.minimum(1.0, longest / jnp.maximum(size, longest * jnp.finfo(z.dtype).eps))
@@ -89,11 +95,11 @@ def solve_on_path(
     start = (stop_gradient(z), nowhere, far, far, jnp.asarray(0, int), far)
     z, at, rate, residual, count, _ = stop_gradient(jax.lax.while_loop(going, step, start))
     residual = jnp.where(jnp.isfinite(residual), residual, jnp.inf)
-    back = fused_matmul(at.back, constraints(system.contacts, z))
+    back = fused_matmul(at.constraint_inverse, constraints(mechanics.contacts, z))
     z = z - jnp.where(jnp.isfinite(back), back, 0.0)
-    turn = fused_matmul(at.back, constraint_velocity(system.contacts, z, at.x))
+    turn = fused_matmul(at.constraint_inverse, constraint_velocity(mechanics.contacts, z, at.x))
     x = jnp.where(jnp.isfinite(at.x), at.x, u) - jnp.where(jnp.isfinite(turn), turn, 0.0)
-    late = function(system, z, x, *parameters) / rate
+    late = function(mechanics, z, x, *parameters) / rate
     late = jnp.where(jnp.isfinite(late), late, 0.0)
-    along, bend = (jnp.where(jnp.isfinite(a), a, 0.0) for a in (at.x, at.bend))
-    return PathRoot(z - along * late, x - bend * late, residual, count)
+    along, curvature = (jnp.where(jnp.isfinite(a), a, 0.0) for a in (at.x, at.curvature))
+    return PathRoot(z - along * late, x - curvature * late, residual, count)

@@ -8,20 +8,27 @@ import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
 
-from wholearm_jax.core.arrays import eps_power
-from wholearm_jax.core.small_linalg import null_vector, solve, fused_matmul
-from wholearm_jax.model.contact_kinematics import FEATURE_GROUPS, PALM_END, FINGER_ROOT, constraint_jacobian, constraints, contact_kinematics
-from wholearm_jax.model.scene import EDGE, VERTEX
+from wholearm_jax.core import eps_power, fused_matmul, null_vector, solve
+from wholearm_jax.model import (
+    EDGE,
+    FEATURE_GROUPS,
+    FINGER_ROOT,
+    PALM_END,
+    VERTEX,
+    constraint_jacobian,
+    constraints,
+    contact_kinematics,
+)
 from wholearm_jax.tracing.continuation import oriented_tangent
 from wholearm_jax.tracing.path_root import solve_on_path
 
 
-def project_onto_path(system, rough):
+def project_onto_path(mechanics, initial_guess):
     """The wire's point nearest to the rough start: least-norm Newton steps to reach it, then Newton on nearness.
 
     Beside it how far constraints are from holding there, and a unit vector along the wire, of either sense.
     """
-    fixed, far = stop_gradient(system), stop_gradient(rough)
+    fixed, far = stop_gradient(mechanics), stop_gradient(initial_guess)
 
     def least(z):
         rows = constraint_jacobian(fixed.contacts, z)
@@ -31,14 +38,16 @@ def project_onto_path(system, rough):
 
     z = jax.lax.fori_loop(0, 12, lambda _, z: least(z), far)
     tangent, _ = oriented_tangent(fixed, z, far)  # of either sense
-    root = solve_on_path(lambda system, z, x, rough: x @ (z - rough), system, z, tangent, rough)
+    root = solve_on_path(
+        lambda mechanics, z, x, initial_guess: x @ (z - initial_guess), mechanics, z, tangent, initial_guess
+    )
     near = jnp.where(root.residual < eps_power(z, 3 / 8), root.z, z)
     fixed_near = stop_gradient(near)
     along, _ = oriented_tangent(fixed, fixed_near, stop_gradient(root.x))
     return near, jnp.abs(constraints(fixed.contacts, fixed_near)).max(), along
 
 
-def violates_contact_limits(system, z):
+def violates_contact_limits(mechanics, z):
     """Whether a contact lies beyond its feature, a vertex behind the palm, a link within the object, or a convex object
     behind a finger that holds it.
 
@@ -46,11 +55,17 @@ def violates_contact_limits(system, z):
     vertex touches the finger.
     """
     tolerance = eps_power(z, 5 / 8)
-    held, pairs = contact_kinematics(system.contacts, z), contact_kinematics(system.candidates, z)
-    beyond = (held.along < system.contacts.lower - tolerance) | (held.along > system.contacts.upper + tolerance)
-    inside = (pairs.along > system.candidates.lower) & (pairs.along < system.candidates.upper)
-    behind = system.watched & system.candidates.on_link & ~system.behind & inside & (pairs.gap < -tolerance)
-    return jnp.any(beyond) | jnp.any(behind) | _link_penetrates_object(system, pairs, tolerance)
+    held, pairs = contact_kinematics(mechanics.contacts, z), contact_kinematics(mechanics.candidates, z)
+    beyond = (held.along < mechanics.contacts.lower - tolerance) | (held.along > mechanics.contacts.upper + tolerance)
+    inside = (pairs.along > mechanics.candidates.lower) & (pairs.along < mechanics.candidates.upper)
+    behind = (
+        mechanics.may_terminate
+        & mechanics.candidates.on_link
+        & ~mechanics.may_be_behind
+        & inside
+        & (pairs.gap < -tolerance)
+    )
+    return jnp.any(beyond) | jnp.any(behind) | _link_penetrates_object(mechanics, pairs, tolerance)
 
 
 # Where each link begins and ends, and vertices against it: fingers from root to tip, the palm from left to right.
@@ -62,13 +77,13 @@ _ENDS = (
 _LINKS = np.array([[FEATURE_GROUPS.index(group) for group in link] for link in _ENDS]).T
 
 
-def _link_penetrates_object(system, pairs, tolerance):
+def _link_penetrates_object(mechanics, pairs, tolerance):
     """Whether part of a finger's contact edge or of the palm lies within the object.
 
     Lines through edges of the object cut each link into parts, and the middle of one lies within where the outline
     passes the rest of the link's line an odd number of times. Gaps and places along edges are linear on a link.
     """
-    grouped = (pairs.gap, pairs.along, system.candidates.lower, system.candidates.upper, system.real)
+    grouped = (pairs.gap, pairs.along, mechanics.candidates.lower, mechanics.candidates.upper, mechanics.exists)
     gap, along, lower, upper, real = (a.reshape(len(FEATURE_GROUPS), -1) for a in grouped)
     begin, end, against = _LINKS
 
@@ -94,18 +109,18 @@ def _link_penetrates_object(system, pairs, tolerance):
     return jnp.any((after > stops) & (times_ahead % 2 == 1) & ~beside)
 
 
-def is_rank_deficient(system, z):
+def is_rank_deficient(mechanics, z):
     """Whether the constraints depend on one another at `z`: their rows span no volume."""
-    rows = constraint_jacobian(system.contacts, z)
+    rows = constraint_jacobian(mechanics.contacts, z)
     rows = rows / jnp.sqrt((rows**2).sum(1, keepdims=True))
     return (null_vector(rows) ** 2).sum() < eps_power(z, 3 / 4)
 
 
-def orient_tangent(along, heading):
+def orient_tangent(along, target):
     """A tangent, turned so that its coordinate `path_target.path_coordinate` has the sign asked for."""
-    return along * jnp.where(along[dominant_coordinate(heading, along)] * heading.sign < 0, -1.0, 1.0)
+    return along * jnp.where(along[dominant_coordinate(target, along)] * target.sign < 0, -1.0, 1.0)
 
 
-def dominant_coordinate(heading, x):
+def dominant_coordinate(target, x):
     """The coordinate that tells which way a wire goes."""
-    return jnp.where(heading.coordinate < 0, jnp.argmax(jnp.abs(x)), heading.coordinate)
+    return jnp.where(target.coordinate < 0, jnp.argmax(jnp.abs(x)), target.coordinate)

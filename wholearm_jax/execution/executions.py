@@ -1,0 +1,336 @@
+r"""Execute: a torque schedule driven open loop through `build_mujoco_model`, and what became of it against the prediction.
+
+The object is placed at the projected start of the plan's first wire, at rest, every gap 0; nothing settles before the
+torque begins. Each step holds the torque of its middle. The plan succeeded if at its end the object stands where the
+prediction says and every contact of the last phase is closed, both to within a tolerance. When a contact is made or
+opened is read off the gaps, by one rule for prediction and execution: it touches while its gap is below `TOUCH` and it
+lies on its feature.
+"""
+
+# MuJoCo's names come from a compiled module, which type checkers cannot see into.
+# pyright: reportAttributeAccessIssue=false
+
+import enum
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float
+
+from wholearm_jax.core import Status, require_positive
+from wholearm_jax.execution.coulomb_friction import advance
+from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
+from wholearm_jax.model import (
+    ContactFormation,
+    Hand,
+    RigidBody,
+    Scene,
+    TorqueSchedule,
+    contact_formation,
+    contact_kinematics,
+    contact_set,
+    feature_pair,
+    rigid_body,
+)
+from wholearm_jax.phases import Result, target_configuration, trajectory
+
+TOUCH = 1e-3  # gap below which a contact counts as touching [object radii]
+SAMPLES = 2001  # of the prediction, a phase
+
+
+class Tolerance(NamedTuple):
+    """How near the predicted end counts as success: `position` and the last contacts' gaps [m], `angle` [rad]."""
+
+    position: float = 5e-4
+    angle: float = 0.01
+
+
+class ExecutionOutcome(enum.Enum):
+    """What became of an execution."""
+
+    OK = "ok"
+    CONTACT_LOST = "contact_lost"  # a contact of the last phase is open
+    ASTRAY = "astray"  # all are closed, but the object does not stand where it should
+    DIVERGED = "diverged"  # MuJoCo gave up, or contacts crept farther than the tolerance: too long a time step
+
+
+class Event(NamedTuple):
+    """A contact made or opened: when [s] in the prediction, and when in the execution; None where it was not."""
+
+    contact: str
+    made: bool
+    predicted: float | None
+    executed: float | None
+
+
+class ExecutedMotion(NamedTuple):
+    """States and contacts over time, SI units. `cn`, `ct` act on the object, 0 without contact; `touch` by `TOUCH`."""
+
+    time: Float[np.ndarray, "samples"]
+    z: Float[np.ndarray, "samples 5"]
+    z_dot: Float[np.ndarray, "samples 5"]
+    cn: Float[np.ndarray, "samples contacts"]
+    ct: Float[np.ndarray, "samples contacts"]
+    touch: Bool[np.ndarray, "samples contacts"]
+
+
+@dataclass(frozen=True)
+class Execution:
+    """An executed plan beside its prediction.
+
+    `course` is what happened, at every step; `expected` what was predicted (NaN: friction holds the object at rest, or
+    the prediction ended). Their contacts are `names`, all pairs that may touch; `planned` are those of the phases,
+    which do not say here whether they should roll. `creep` is how far contacts slipped against Coulomb's law, at most
+    [m]: an execution that crept farther than its tolerance diverged.
+    """
+
+    prediction: Result
+    course: ExecutedMotion
+    expected: ExecutedMotion
+    names: tuple[str, ...]
+    target: Float[np.ndarray, "5"]
+    tolerance: Tolerance
+    ending: ExecutionOutcome
+    creep: float
+    open_at_end: tuple[str, ...]
+    events: tuple[Event, ...]
+    timestep: float
+    model_xml: str
+
+    @property
+    def planned(self) -> tuple[str, ...]:
+        """The contacts of all phases, each once."""
+        return tuple(dict.fromkeys(feature_pair(name) for phase in self.prediction.phases for name in phase.contacts))
+
+    @property
+    def position_error(self) -> float:
+        """Distance of the object from where the plan ends [m]."""
+        return float(np.hypot(*(self.course.z[-1] - self.target)[:2]))
+
+    @property
+    def angle_error(self) -> float:
+        """Its angle against that of the plan's end [rad]."""
+        return float(self.course.z[-1, 2] - self.target[2])
+
+    @property
+    def message(self) -> str:
+        """What became of the execution, in one line."""
+        off = f"{1e3 * self.position_error:.3g} mm and {abs(self.angle_error):.2g} rad from the predicted end"
+        why = f" at {', '.join(self.open_at_end)}" if self.open_at_end else ""
+        if self.ending is ExecutionOutcome.DIVERGED:
+            crept = f"contacts crept {1e3 * self.creep:.3g} mm"
+            why = f" ({crept if np.isfinite(self.creep) else 'MuJoCo gave up'}: take a shorter time step)"
+        return f"{self.ending.value}{why}, {off}"
+
+    def force(self, contact: str, times=None) -> Float[np.ndarray, "times"]:
+        """A contact's executed normal force [N] at given times, by default those of `expected`."""
+        times = self.expected.time if times is None else times
+        return np.interp(times, self.course.time, self.course.cn[:, self.names.index(feature_pair(contact))])
+
+
+def execute(
+    prediction: Result,
+    *,
+    timestep: float = 2e-4,
+    softness: ContactCompliance = ContactCompliance(),
+    tolerance: Tolerance = Tolerance(),
+) -> Execution:
+    """Drive the free bodies by a predicted plan's torque schedule, from its start to its end.
+
+    The prediction may fail, but its wires must be known: raises ValueError where one could not be traced, and for a
+    `timestep` that is not positive.
+    """
+    require_positive(timestep=timestep)
+    scene = prediction.scene
+    require_wires(prediction)
+    times, step = clock(scene, timestep)
+    bodies = build_mujoco_model(scene, step, softness)
+    course, creep = run_schedule(
+        bodies, scene, start_of(prediction), motor_torques(prediction.torque, times, step), step
+    )
+    expected, target = _expected(prediction, bodies.names), target_of(prediction)
+    ending, lost = assess_execution(scene, course.z[-1], target, tolerance, creep)
+    return Execution(
+        prediction=prediction,
+        course=course,
+        expected=expected,
+        names=bodies.names,
+        target=target,
+        tolerance=tolerance,
+        ending=ending,
+        creep=creep,
+        open_at_end=lost,
+        events=_events(bodies.names, expected, course),
+        timestep=step,
+        model_xml=bodies.xml,
+    )
+
+
+def require_wires(prediction: Result) -> None:
+    """Raise ValueError where a plan has no end to compare with."""
+    for phase in prediction.phases:
+        if int(phase.traced.dynamics.status) != Status.OK:
+            raise ValueError(phase.message)
+
+
+def clock(scene: Scene, timestep: float) -> tuple[Float[np.ndarray, "steps"], float]:
+    """When the steps begin, and their length [s], the nearest to `timestep` that divides the plan's duration."""
+    total = sum(float(phase.duration) for phase in scene.phases)
+    count = max(1, round(total / timestep))
+    return np.arange(count) * (total / count), total / count
+
+
+def motor_torques(
+    schedule: TorqueSchedule, begins: Float[np.ndarray, "steps"], step: float
+) -> Float[np.ndarray, "steps 2"]:
+    """The torque [N m] that each step of length `step` [s] holds: that at its middle."""
+    times, values = np.asarray(schedule.times), np.asarray(schedule.values)
+    middle = begins + step / 2
+    return np.stack([np.interp(middle, times, values[:, k]) for k in range(2)], axis=1)
+
+
+def start_of(prediction: Result) -> Float[np.ndarray, "5"]:
+    """The projected start of the plan's first wire."""
+    traced = prediction.phases[0].traced
+    radius = np.hypot(*np.asarray(rigid_body(prediction.scene.object).vertices).T).max()
+    return np.asarray(traced.path.start) * np.array([radius, radius, 1.0, 1.0, 1.0])
+
+
+def target_of(prediction: Result) -> Float[np.ndarray, "5"]:
+    """Where the plan ends: its last phase's destination, or the predicted end where it need not stand still there."""
+    last = prediction.phases[-1]
+    moving = last.arrive in ("moving", "caught") and prediction.status is Status.OK
+    end = (
+        trajectory(prediction, 2)[-1].z[-1]
+        if moving
+        else target_configuration(prediction.scene.phases[-1], last.traced)
+    )
+    return np.asarray(end)
+
+
+def run_schedule(bodies: MujocoModel, scene: Scene, start, torques, timestep: float) -> tuple[ExecutedMotion, float]:
+    """The course of `trace_phase_path`, and how far contacts crept."""
+    z, z_dot, forces, creep = rollout(bodies, start, torques)
+    times = np.arange(len(z)) * timestep
+    return ExecutedMotion(
+        times, z, z_dot, forces[..., 0], forces[..., 1], touching_contacts_at(scene, bodies.names, z)
+    ), creep
+
+
+def rollout(bodies: MujocoModel, start, torques):
+    """Step the model from rest at `start`: `z`, `z_dot` and forces `(c_n, c_t)`; row `k` is the state before step `k`.
+
+    The last is how far contacts slipped against Coulomb's law in all steps together, at most [m]; infinite where
+    MuJoCo gave up.
+    """
+    data, step = mujoco.MjData(bodies.model), stepper(bodies)
+    count, pairs = len(torques), len(bodies.names)
+    z, z_dot, forces = np.empty((count + 1, 5)), np.empty((count + 1, 5)), np.empty((count + 1, pairs, 2))
+    data.qpos[:] = start
+    found, creep = np.zeros((pairs, 2)), 0.0
+    for k, torque in enumerate(torques):
+        z[k], z_dot[k] = data.qpos, data.qvel
+        found, wrong = step(bodies, data, torque, found)
+        forces[k], creep = found, creep + wrong * bodies.model.opt.timestep
+    z[count], z_dot[count] = data.qpos, data.qvel
+    forces[count], _ = step(bodies, data, torques[-1], found)  # beyond the end, for the forces there
+    gave_up = any(warning.number for warning in data.warning)
+    return z, z_dot, forces, np.inf if gave_up else creep
+
+
+def stepper(bodies: MujocoModel) -> Callable:
+    """`coulomb.step`, or the same with MuJoCo's own friction."""
+    return advance if bodies.softness.friction == "coulomb" else _advance
+
+
+def _advance(bodies: MujocoModel, data: mujoco.MjData, torque, before):
+    data.ctrl[:] = torque
+    mujoco.mj_step(bodies.model, data)  # its contacts are those of the state before the step
+    forces = np.zeros_like(before)
+    _read_forces(bodies, data, forces)
+    return forces, 0.0
+
+
+def _read_forces(bodies: MujocoModel, data: mujoco.MjData, into) -> None:
+    """Add the forces of all contacts, `(c_n, c_t)` on the object, to their pairs' rows."""
+    contact = data.contact
+    if not len(contact.dist):
+        return
+    row = bodies.pair[contact.geom[:, 0], contact.geom[:, 1]]
+    axes = contact.frame.reshape(-1, 3, 3)[:, :, :2]
+    at = contact.efc_address
+    acting = np.flatnonzero(at >= 0)
+    rows = at[acting, None] + np.arange(3)
+    force = np.einsum("ci,cik->ck", data.efc_force[rows], axes[acting])
+    toward = bodies.toward[row[acting]]
+    normal = axes[acting, 0] * toward[:, None]
+    force *= toward[:, None]
+    np.add.at(into[:, 0], row[acting], (force * normal).sum(1))
+    np.add.at(into[:, 1], row[acting], force[:, 0] * normal[:, 1] - force[:, 1] * normal[:, 0])
+
+
+def touching_contacts_at(scene: Scene, names: tuple[str, ...], z, slack: float | None = None) -> np.ndarray:
+    """Which contacts are closed to within `force_slack` [m] (default: `TOUCH`) at configurations `z (samples, 5)`."""
+    solid = rigid_body(scene.object)
+    slack = TOUCH * float(np.hypot(*np.asarray(solid.vertices).T).max()) if slack is None else slack
+    return np.asarray(_touching(solid, scene.hand, contact_formation(names), z, slack))
+
+
+@jax.jit
+def _touching(solid: RigidBody, hand: Hand, pairs: ContactFormation, z, slack):
+    several = contact_set(solid, hand, pairs)
+    at = jax.vmap(contact_kinematics, (None, 0))(several, z)
+    on_feature = (at.along > several.lower - slack) & (at.along < several.upper + slack)
+    return (jnp.abs(at.gap) < slack) & on_feature  # far behind an edge's line the gap is negative, and nothing touches
+
+
+def assess_execution(
+    scene: Scene, z, target, tolerance: Tolerance, creep: float = 0.0
+) -> tuple[ExecutionOutcome, tuple[str, ...]]:
+    """What became of an execution that ended at `z` and crept so far, and which contacts of the last phase are open."""
+    names = tuple(map(feature_pair, scene.phases[-1].formation.names))
+    closed = touching_contacts_at(scene, names, z[None], tolerance.position)[0]
+    lost = tuple(name for name, there in zip(names, closed, strict=True) if not there)
+    off = np.abs(z - target)
+    near = np.hypot(*off[:2]) <= tolerance.position and off[2] <= tolerance.angle
+    if not creep <= tolerance.position:
+        return ExecutionOutcome.DIVERGED, lost
+    return (ExecutionOutcome.CONTACT_LOST if lost else ExecutionOutcome.OK if near else ExecutionOutcome.ASTRAY), lost
+
+
+def _expected(prediction: Result, names: tuple[str, ...]) -> ExecutedMotion:
+    """The prediction as a course over all `names`."""
+    phases = []
+    for phase, at in zip(prediction.phases, trajectory(prediction, SAMPLES), strict=False):
+        cn, ct = np.zeros((2, SAMPLES, len(names)))
+        columns = [names.index(feature_pair(name)) for name in phase.contacts]
+        cn[:, columns], ct[:, columns] = at.cn[:, : len(columns)], at.ct[:, : len(columns)]
+        time, z, z_dot = (np.asarray(a) for a in (at.time, at.z, at.z_dot))
+        phases.append(ExecutedMotion(time, z, z_dot, cn, ct, touching_contacts_at(prediction.scene, names, z)))
+    return ExecutedMotion(*(np.concatenate(field) for field in zip(*phases, strict=True)))
+
+
+def _events(names: tuple[str, ...], expected: ExecutedMotion, course: ExecutedMotion) -> tuple[Event, ...]:
+    """Changes of contact in the prediction, each beside the nearest like one in the execution; then what is left."""
+    found, events = _changes(course), []
+    for (contact, made), whens in _changes(expected).items():
+        for when in whens:
+            others = found.get((contact, made), [])
+            nearest = min(others, key=lambda t, when=when: abs(t - when), default=None)
+            if nearest is not None:
+                others.remove(nearest)
+            events.append(Event(names[contact], made, when, nearest))
+    events += [Event(names[c], made, None, when) for (c, made), whens in found.items() for when in whens]
+    return tuple(sorted(events, key=lambda e: e.executed if e.predicted is None else e.predicted))
+
+
+def _changes(course: ExecutedMotion) -> dict[tuple[int, bool], list[float]]:
+    """(contact, made) -> the times at which a contact is made (True) or opened (False)."""
+    found: dict[tuple[int, bool], list[float]] = {}
+    for row, contact in np.argwhere(course.touch[1:] != course.touch[:-1]):
+        found.setdefault((int(contact), bool(course.touch[row + 1, contact])), []).append(float(course.time[row + 1]))
+    return found

@@ -1,0 +1,3 @@
+"""The HTML page of a result folder."""
+
+from wholearm_jax.report.page import report
