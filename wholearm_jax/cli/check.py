@@ -270,7 +270,7 @@ def _report(store, scene, source, out: Path):
     told = summarise(scene, (store.read(k) for k in range(store.chunks)), store.count)
     shown, more = (), {}
     if isinstance(source, Ensemble) and source.parameters:
-        shifts = np.asarray(jax.lax.map(source.shifts, told.numbers, batch_size=1024))
+        shifts = np.asarray(jax.lax.map(source.draw_offsets, told.numbers, batch_size=1024))
         influence = rank_correlations(told.margins, shifts)
         shown = tuple((source.parameters[k], shifts[:, k]) for k in most_influential(source.parameters, influence))
         pairs = zip(source.parameters, influence.tolist(), strict=True)

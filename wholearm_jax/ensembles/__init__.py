@@ -11,14 +11,19 @@ from wholearm_jax.ensembles.batch import (
     from_result,
 )
 from wholearm_jax.ensembles.ensemble import Ensemble, make_ensemble
-from wholearm_jax.ensembles.proportion import wilson_interval
 from wholearm_jax.ensembles.robust import optimise_robustly
-from wholearm_jax.ensembles.summary import EnsembleSummary, most_influential, rank_correlations, summarise
+from wholearm_jax.ensembles.summary import (
+    EnsembleSummary,
+    most_influential,
+    rank_correlations,
+    summarise,
+    wilson_interval,
+)
 
 __all__ = [
     "BLOCK",
-    "BatchResult",
     "COARSE_PASS",
+    "BatchResult",
     "Ensemble",
     "EnsembleSummary",
     "SceneBatch",

@@ -77,14 +77,14 @@ class Ensemble(eqx.Module):
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """The names of the numbers that vary, in the order of `shifts`; rows of vertices that pad are among them."""
+        """The names of the numbers that vary, in the order of `draw_offsets`; rows of vertices that pad are among them."""
         return tuple(name for quantity, _ in self.amounts for name in _names(self.scene, quantity))
 
     def draw(self, number: Int[Array, ""]) -> Scene:
         """Scene number `number`."""
-        return self.shifted(self.shifts(number))
+        return self.apply_offsets(self.draw_offsets(number))
 
-    def shifts(self, number: Int[Array, ""]) -> Float[Array, "parameters"]:
+    def draw_offsets(self, number: Int[Array, ""]) -> Float[Array, "parameters"]:
         """What is drawn for scene number `number`: one number in [-1, 1] a parameter, to be scaled by its amount."""
         drawn = [jnp.zeros(0)]
         for quantity, _ in self.amounts:
@@ -96,7 +96,7 @@ class Ensemble(eqx.Module):
             drawn.append(part)
         return jnp.concatenate(drawn)
 
-    def shifted(self, shifts: Float[Array, "parameters"]) -> Scene:
+    def apply_offsets(self, shifts: Float[Array, "parameters"]) -> Scene:
         """The scene that a draw stands for."""
         scene, at = self.scene, 0
         for quantity, amount in self.amounts:

@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from wholearm_jax.core import Status
 from wholearm_jax.ensembles.batch import BatchResult
-from wholearm_jax.ensembles.proportion import wilson_interval
 from wholearm_jax.model import Scene
 
 SAMPLE = 100_000  # scenes, evenly spread, from which quantiles and influences are taken
@@ -91,19 +90,26 @@ def summarise(scene: Scene, chunks: Iterable[BatchResult], count: int) -> Ensemb
     )
 
 
-def rank_correlations(
-    margins: Float[np.ndarray, "n"], shifts: Float[np.ndarray, "n parameters"]
-) -> Float[np.ndarray, "p"]:
-    """Spearman's rank correlation of the margin with each parameter, like values sharing the mean of their ranks; 0
-    where either does not vary."""
-    from scipy.stats import rankdata  # takes half a second to import
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Wilson's 95 % confidence interval of a proportion."""
+    from scipy.stats import binomtest  # takes half a second to import
 
-    ranks = rankdata(margins)
-    found = []
-    for column in shifts.T:
-        varies = len(margins) > 1 and np.ptp(column) > 0 and np.ptp(ranks) > 0
-        found.append(np.corrcoef(ranks, rankdata(column))[0, 1] if varies else 0.0)
-    return np.asarray(found)
+    interval = binomtest(int(successes), int(trials)).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def rank_correlations(
+    margins: Float[np.ndarray, "scenes"], offsets: Float[np.ndarray, "scenes parameters"]
+) -> Float[np.ndarray, "parameters"]:
+    """Compute Spearman's rank correlation of the margin with each parameter; 0 where either does not vary."""
+    from scipy.stats import spearmanr
+
+    correlations = np.zeros(offsets.shape[1])
+    if len(margins) > 1 and np.any(margins != margins[0]):
+        for k, column in enumerate(offsets.T):
+            if np.ptp(column) > 0:
+                correlations[k] = spearmanr(margins, column).statistic
+    return correlations
 
 
 def most_influential(parameters: Sequence[str], influence: Float[np.ndarray, "p"], most: int = 2) -> list[int]:

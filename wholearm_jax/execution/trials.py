@@ -1,9 +1,9 @@
 r"""Perturb: a plan executed many times with friction, mass, geometry and start a little off, and how often it succeeds.
 
-Every draw is uniform within plus or minus its amount: a factor on each link's friction coefficient, one on the mass
-(and with it the inertia), a shift of each coordinate of each vertex, and a shift of the object's start in x, y and, by
-that over its radius, phi. The object that is then laid in the hand touches as the first formation says: the start is
-the nearest configuration at which the perturbed object's gaps are 0 (least-norm Newton steps in object units). The
+Every draw is uniform within plus or minus its amount, as in an ensemble (`ensembles.make_ensemble`): a factor on each
+link's friction coefficient, one on the mass (and with it the inertia), an offset of each coordinate of each vertex, and
+a displacement of the object's start in x, y and, over its radius, phi. The object that is then laid in the hand touches
+as the first formation says: the start is the nearest configuration at which the perturbed object's gaps are 0 (least-norm Newton steps in object units). The
 torques stay those of the unperturbed plan, and so does the end that counts as success.
 """
 
@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +22,7 @@ from jaxtyping import Array, Float
 from joblib import Parallel, delayed
 
 from wholearm_jax.core import require_positive
-from wholearm_jax.ensembles import wilson_interval
+from wholearm_jax.ensembles import make_ensemble, wilson_interval
 from wholearm_jax.execution.executions import (
     ExecutionOutcome,
     Tolerance,
@@ -45,7 +44,7 @@ from wholearm_jax.model import (
     rigid_body,
     scaled_mechanics,
 )
-from wholearm_jax.phases import Result
+from wholearm_jax.phases import Result, unstack_trees
 
 
 class Amounts(NamedTuple):
@@ -115,15 +114,14 @@ def run_trials(
     require_positive(count=count, timestep=timestep)
     require_wires(prediction)
     require_objects(prediction.scene, amounts)
-    rng = np.random.default_rng(seed)
-    scenes = [_perturbed(prediction.scene, amounts, rng) for _ in range(count)]
-    shifts = rng.uniform(-1, 1, (count, 3)) * amounts.start
+    scenes = _draw_scenes(prediction.scene, amounts, seed, count)
+    displacements = _draw_displacements(prediction.scene, amounts, seed, count)
     begins, step = clock(prediction.scene, timestep)
     torques = motor_torques(prediction.torque, begins, step)
     nominal, target = start_of(prediction), target_of(prediction)
 
     def copies():
-        for scene, shift in zip(scenes, shifts, strict=True):
+        for scene, shift in zip(scenes, displacements, strict=True):
             yield build_mujoco_model(scene, step, softness), start_near(scene, nominal, shift)
 
     found = rollout_in_parallel(copies(), torques, min(workers or os.cpu_count() or 1, count))
@@ -145,21 +143,21 @@ def require_objects(scene: Scene, amounts: Amounts) -> None:
         raise ValueError(f"geometry {amounts.geometry:g}: too much, edges of the polygon could cross")
 
 
-def _perturbed(scene: Scene, amounts: Amounts, rng: np.random.Generator) -> Scene:
-    """The scene with another object. Everything is drawn whatever the amounts, so that each keeps its own sequence."""
-    shape = scene.object
-    friction = 1 + amounts.friction * rng.uniform(-1, 1, 3)
-    mass = 1 + amounts.mass * rng.uniform(-1, 1)
-    shift = amounts.geometry * rng.uniform(-1, 1, shape.vertices.shape)
-    shift[int(shape.count) :] = shift[int(shape.count) - 1]  # padding repeats the last vertex
-    changed = eqx.tree_at(
-        lambda s: (s.friction, s.mass, s.vertices),
-        shape,
-        (shape.friction * friction, shape.mass * mass, shape.vertices + shift),
-    )
-    if shape.inertia is not None:
-        changed = eqx.tree_at(lambda s: s.inertia, changed, shape.inertia * mass)
-    return eqx.tree_at(lambda s: s.object, scene, changed)
+def _draw_scenes(scene: Scene, amounts: Amounts, seed: int, count: int) -> tuple[Scene, ...]:
+    """Draw `count` scenes with other objects. Each amount keeps its own sequence, whatever the others are."""
+    spreads = {
+        "friction": f"{100 * amounts.friction!r}%",
+        "mass": f"{100 * amounts.mass!r}%",
+        "vertices": amounts.geometry,
+    }
+    ensemble = make_ensemble(scene, spreads, seed=seed)
+    return unstack_trees(jax.device_get(jax.vmap(ensemble.draw)(jnp.arange(count))), count)
+
+
+def _draw_displacements(scene: Scene, amounts: Amounts, seed: int, count: int) -> Float[np.ndarray, "count 3"]:
+    """Draw displacements [m] of the object's start in x, y and, over the object's radius, phi."""
+    ensemble = make_ensemble(scene, {"start": amounts.start}, seed=seed)
+    return np.asarray(jax.vmap(ensemble.draw_offsets)(jnp.arange(count)))[:, :3] * amounts.start
 
 
 def start_near(scene: Scene, z, shift) -> Float[np.ndarray, "5"]:

@@ -27,6 +27,7 @@ from wholearm_jax.phases.plan import (
     stack_trees,
     trace,
     trace_paths_in_one_program,
+    unstack_trees,
     with_plan_step_capacity,
 )
 from wholearm_jax.phases.rest_certificate import certify_rest
