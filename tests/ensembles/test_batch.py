@@ -15,18 +15,11 @@ from wholearm_jax.cli import app as command
 from wholearm_jax.cli import check as batch_command
 from wholearm_jax.core.status import Status
 from wholearm_jax.ensembles import summary as survey_module
-from wholearm_jax.ensembles.batch import (
-    ALONE,
-    COARSE_PASS,
-    GOOD,
-    BatchResult,
-    _checks_of,
-    _wires_of,
-    check_in_chunks,
-    check_scene,
-    from_result,
-)
-from wholearm_jax.ensembles.ensemble import make_ensemble, stack
+from wholearm_jax.ensembles.batch import check_in_chunks
+from wholearm_jax.ensembles.ensemble import make_ensemble
+from wholearm_jax.ensembles.passes import check_block, trace_block
+from wholearm_jax.ensembles.scene_batch import stack_scenes
+from wholearm_jax.ensembles.scene_check import COARSE_PASS, BatchResult, NextPass, check_scene, from_result
 from wholearm_jax.ensembles.summary import rank_correlations, summarise
 from wholearm_jax.files.check_store import StoreError, fingerprint, identity, open_store
 from wholearm_jax.files.polygons_npz import how_many, read_polygons
@@ -80,7 +73,7 @@ def test_each_scene_is_what_simulate_says_of_it_alone(drawn, schedule, checked):
 
 def test_margins_are_right_to_what_is_said_by_default(ensemble, schedule, checked):
     """A coarser level computes them: 1e-6 N, and all else to as many digits; not the same numbers."""
-    assert not ensemble.same_wires
+    assert not ensemble.has_common_paths
     quick = wa.check(ensemble, schedule, count=COUNT, arrival=ARRIVAL)
     np.testing.assert_array_equal(quick.status, checked.status)
     np.testing.assert_array_equal(quick.contact, checked.contact)
@@ -91,7 +84,7 @@ def test_margins_are_right_to_what_is_said_by_default(ensemble, schedule, checke
 
 def test_scenes_with_the_same_wires_are_what_they_are_alone(scene, schedule):
     loose = make_ensemble(scene, {"friction": "10%", "mass": "5%"}, seed=SEED)
-    assert loose.same_wires
+    assert loose.has_common_paths
     checked = wa.check(loose, schedule, count=2, arrival=ARRIVAL, tolerance=1e-10)
     assert checked.margin[0] != checked.margin[1]
     for number in range(2):
@@ -117,13 +110,13 @@ def test_what_follows_a_failure_must_be_known_as_well(scene, schedule):
 
     @jax.jit
     def checked(limit):
-        return check_scene(scene, torque, ARRIVAL, COARSE_PASS._replace(error=limit))
+        return check_scene(scene, torque, ARRIVAL, COARSE_PASS._replace(max_error=limit))
 
     for limit, enough in ((np.sqrt(errors[0] * errors[1]), False), (2 * errors[1], True)):
         answer, grade = checked(limit)
         assert int(answer.status) != Status.OK
         assert int(answer.phase) == 0
-        assert (int(grade) == GOOD) is enough
+        assert (int(grade) == NextPass.DONE) is enough
 
 
 def test_a_draw_depends_on_its_number_alone(scene, ensemble):
@@ -139,10 +132,10 @@ def test_a_draw_depends_on_its_number_alone(scene, ensemble):
 
 def test_polygons_of_different_size_stack(scene):
     nine = eqx.tree_at(lambda s: s.object.vertices, scene, jnp.concatenate([scene.object.vertices] * 2))
-    both = stack([scene, nine])
+    both = stack_scenes([scene, nine])
     assert both.object.vertices.shape == (2, 16, 2)
     with pytest.raises(ValueError, match="same phases"):
-        stack([scene, wa.load("flight")])
+        stack_scenes([scene, wa.load("flight")])
 
 
 def test_amounts_that_are_not_are_refused(scene):
@@ -256,7 +249,7 @@ def test_the_survey_says_what_fails_where(scene, monkeypatch):
     }
     np.testing.assert_array_equal(told.numbers, np.arange(7))
     np.testing.assert_array_equal(told.margins, margin)
-    monkeypatch.setattr(survey_module, "SAMPLE", 3)
+    monkeypatch.setattr(survey_module, "SAMPLE_SIZE", 3)
     few = summarise(scene, parts, 7)
     np.testing.assert_array_equal(few.numbers, [0, 3, 6])
     np.testing.assert_array_equal(few.margins, margin[[0, 3, 6]])
@@ -318,7 +311,9 @@ def test_a_store_goes_on_and_ends_the_same(tmp_path, ensemble, schedule):
     again = open_store(tmp_path / "broken", wanted)
     missing = [k for k in range(again.chunks) if not again.done()[k]]
     assert missing == [0, 2]
-    for number, part in check_in_chunks(ensemble, schedule, COUNT, chunk=2, arrival=ARRIVAL, wanted=missing[::-1]):
+    for number, part in check_in_chunks(
+        ensemble, schedule, COUNT, chunk=2, arrival=ARRIVAL, chunk_numbers=missing[::-1]
+    ):
         again.write(number, part._asdict())
     for number in range(3):
         for one, other in zip(whole.read(number), again.read(number), strict=True):
@@ -436,7 +431,7 @@ def test_an_object_waits_only_where_some_forces_hold_it(scene, schedule, ways):
     assert (alone.phases[0].holds[0].loss_time is None) is held
     step = COARSE_PASS._replace(options=replace(COARSE_PASS.options, has_jumps=True))
     _, grade = jax.jit(lambda: check_scene(scene, pad_schedule(torque), ARRIVAL, step))()
-    assert int(grade) == (GOOD if held else ALONE)
+    assert int(grade) == (NextPass.DONE if held else NextPass.SINGLE)
     assert_as_alone(wa.check([scene], torque, arrival=ARRIVAL, tolerance=1e-10), scene, torque, 0)
 
 
@@ -462,9 +457,9 @@ def test_scenes_side_by_side_as_on_a_gpu_are_what_they_are_one_after_the_other(e
             options=replace(COARSE_PASS.options, has_jumps=has_torque_jumps(ensemble.scene, schedule))
         ),
     )
-    paths = _wires_of((ensemble, level.resolution, True), numbers)
-    found, grade = _checks_of((ensemble, pad_schedule(schedule), ARRIVAL, level, True), numbers, paths)
-    assert grade.tolist() == [GOOD] * len(numbers)
+    paths = trace_block((ensemble, level.resolution, True), numbers)
+    found, grade = check_block((ensemble, pad_schedule(schedule), ARRIVAL, level, True), numbers, paths)
+    assert grade.tolist() == [NextPass.DONE] * len(numbers)
     one_by_one = wa.check(ensemble, schedule, count=len(numbers), arrival=ARRIVAL)
     for each, other in zip(found, one_by_one, strict=True):
         np.testing.assert_allclose(each, other, rtol=1e-9, atol=1e-9)

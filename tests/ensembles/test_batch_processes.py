@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from wholearm_jax.ensembles.batch import BatchResult
+from wholearm_jax.ensembles.scene_check import BatchResult
 from wholearm_jax.files.check_store import TYPES, StoreError, identity, open_store
 
 zarr = pytest.importorskip("zarr")

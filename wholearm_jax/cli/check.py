@@ -228,7 +228,7 @@ def _checked(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
     from wholearm_jax.ensembles import check_in_chunks
 
     settings = {"tolerance": job.settings["tolerance"], "arrival": job.settings["arrival"]}
-    parts = check_in_chunks(job.source, job.torque, job.count, chunk=job.chunk, wanted=missing, **settings)
+    parts = check_in_chunks(job.source, job.torque, job.count, chunk=job.chunk, chunk_numbers=missing, **settings)
     for number, part in parts:
         yield number, part._asdict()
 

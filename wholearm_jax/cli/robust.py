@@ -34,7 +34,7 @@ def optimise_robustly(
     result = simulate(varied.scene, found.torque, arrival=arrival)
     nominal, robust = found.out_of_sample
     more = {"command": "optimise --robust", "knots": knots, "steps": steps, "varied": samples, "arrival": arrival}
-    amounts = (f"{name}={100 * a.size:g}%" if a.relative else f"{name}={a.size:g}" for name, a in varied.amounts)
+    amounts = (f"{name}={100 * a.size:g}%" if a.relative else f"{name}={a.size:g}" for name, a in varied.spreads)
     more |= {"robust": ", ".join(amounts), "seed": varied.seed}
     more |= {"unseen_share": robust.success_rate, "unseen_margin": robust.margin}
     more |= {"unseen_share_nominal": nominal.success_rate, "unseen_margin_nominal": nominal.margin}

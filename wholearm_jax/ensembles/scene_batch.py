@@ -1,0 +1,91 @@
+"""Sources of scenes for a check: scenes stacked along a leading axis, and the interface shared with ensembles."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from wholearm_jax.model import Scene
+from wholearm_jax.phases import stack_trees
+
+
+class SceneSource(Protocol):
+    """Numbered scenes to check: an `Ensemble`, or a `SceneBatch`."""
+
+    @property
+    def nominal(self) -> Scene:
+        """Scene, or stacked scenes, with the phases, names and arrivals that all scenes have in common."""
+        ...
+
+    @property
+    def has_common_paths(self) -> bool:
+        """Whether all scenes have the same contact paths."""
+        ...
+
+    def draw(self, number: Int[Array, ""]) -> Scene:
+        """Return scene number `number`."""
+        ...
+
+
+class SceneBatch(eqx.Module):
+    """Scenes stacked along a leading axis (`stack_scenes`)."""
+
+    scenes: Scene
+
+    @property
+    def nominal(self) -> Scene:
+        """The stacked scenes."""
+        return self.scenes
+
+    @property
+    def has_common_paths(self) -> bool:
+        """False: unknown, so every scene is traced."""
+        return False
+
+    @property
+    def count(self) -> int:
+        """Number of scenes."""
+        return self.scenes.object.mass.shape[0]
+
+    def draw(self, number: Int[Array, ""]) -> Scene:
+        """Return scene number `number`."""
+        return jax.tree.map(lambda leaf: leaf[number], self.scenes)
+
+    def select(self, numbers: np.ndarray) -> "SceneBatch":
+        """Return the batch of some of the scenes, renumbered from 0."""
+        return SceneBatch(jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), self.scenes))
+
+
+def stack_scenes(scenes: Sequence[Scene]) -> Scene:
+    """Stack scenes along a leading axis of every array; polygons are padded to the largest.
+
+    Names and titles are the first scene's. Raises ValueError for no scenes, and for scenes that differ in their number
+    of phases, in how a phase arrives, or in whether inertia and centre of mass are given.
+    """
+    if not scenes:
+        raise ValueError("there are no scenes to stack")
+    capacity = max(s.object.vertices.shape[0] for s in scenes)
+    alike = [_with_names_of(_pad_polygon(s, capacity), scenes[0]) for s in scenes]
+    if len({jax.tree.structure(s) for s in alike}) > 1:
+        raise ValueError("stacked scenes need the same phases (number, arrival) and the same optional entries")
+    return stack_trees(alike)
+
+
+def _pad_polygon(scene: Scene, capacity: int) -> Scene:
+    """Pad the polygon to `capacity` rows by repeating its last vertex."""
+    vertices = scene.object.vertices
+    padding = jnp.broadcast_to(vertices[-1], (capacity - vertices.shape[0], 2))
+    return eqx.tree_at(lambda s: s.object.vertices, scene, jnp.concatenate([vertices, padding]))
+
+
+def _with_names_of(scene: Scene, other: Scene) -> Scene:
+    """Return the scene with the title and phase names of another; they do not affect what is computed."""
+    if len(scene.phases) != len(other.phases):
+        return scene
+    pairs = zip(scene.phases, other.phases, strict=True)
+    phases = tuple(type(p)(q.name, p.formation, p.target, p.duration, p.arrive) for p, q in pairs)
+    return Scene(other.title, scene.gravity, scene.hand, scene.object, scene.start, phases)
