@@ -1,4 +1,4 @@
-"""Judge: what became of a simulated phase, from its motion and its score."""
+"""Assessment of a simulated phase: its status, from its motion and its margin."""
 
 from typing import NamedTuple
 
@@ -10,24 +10,24 @@ from wholearm_jax.dynamics import Impact, PathDynamics
 from wholearm_jax.margin import MarginResult, force_slack
 from wholearm_jax.simulation import Motion
 
-DEFAULT_ARRIVAL = 1e-6  # of the wire's length: how near its end a phase that arrives at rest must come
+DEFAULT_ARRIVAL = 1e-6  # distance from its path's end, in path lengths, within which a phase must end
 ARRIVAL_SPEED_FACTOR = 12.0
-"""The speed left at arrival within a share `a` of the wire is at most `sqrt(BRAKING a)` wire lengths a duration: what
-braking at 6 lengths a duration squared (the even rest-to-rest motion) ends within `a` of a length. Nearer to the end
-time and position do not fix the speed better than this square root."""
+"""Speed allowed at arrival: within a distance `a` of the end, in path lengths, it is at most `sqrt(12 a)` path lengths
+per duration, from which braking at 6 lengths per duration squared (the uniform rest-to-rest motion) stops within `a`.
+Nearer to the end, time and position do not fix the speed better than this square root."""
 
 GOALS = {"moving": 0, "caught": 0, "rest": 1, "hold": 2}
 """How a phase must end, as a number that compiled programs take: at any speed, at rest, where it began."""
 
-IMPULSE_ROUNDING = 1e-9  # share of `Impact.size` by which an impulse may be negative for rounding
+IMPULSE_ROUNDING = 1e-9  # fraction of `Impact.size` by which rounding may make an impulse negative
 
 
 class Assessment(NamedTuple):
-    """A phase's `status`, when as a share of its duration, and the contact concerned (-1: none)."""
+    """Status of a phase, and the time and contact of its end or failure."""
 
     status: Int[Array, ""]
-    phase_time: Float[Array, ""]
-    contact: Int[Array, ""]
+    phase_time: Float[Array, ""]  # fraction of the duration
+    contact: Int[Array, ""]  # constraint row; -1: none
 
 
 def assess_phase(
@@ -35,43 +35,66 @@ def assess_phase(
     motion: Motion,
     margin_result: MarginResult,
     goal: Int[Array, ""],
-    entered: Impact,
+    impact: Impact,
     arrival: float | Float[Array, ""] = DEFAULT_ARRIVAL,
 ) -> Assessment:
-    """Decide the status of a phase that must end as `goal` says (one of `GOALS`), within a share `arrival` of its
-    wire's length.
+    """Decide the status of a phase from the earliest trouble.
 
-    The earliest trouble counts: a wire that cannot be traced, an impulse that would pull (or throw the object back)
-    where the phase is entered with speed, a tensile force, then how the motion ended. A phase that holds the object
-    fails when it departs: `reversed` backward, `not_reached` forward along the way that its wire was traced.
+    In order of precedence: a path that cannot be traced, an impulse that would pull or throw the object back at entry,
+    a tensile force, then how the motion ended. A phase that holds the object fails when it departs: `reversed`
+    backward, `not_reached` forward in the direction in which its path was traced.
+
+    Args:
+        dynamics: Tabulated path dynamics.
+        motion: Simulated motion.
+        margin_result: Margin of the motion, with the first loss of contact.
+        goal: How the phase must end, one of `GOALS`.
+        impact: Impact at which the phase is entered.
+        arrival: Distance from the path's end within which the phase must end, in path lengths.
     """
-    at_rest, holds = goal == GOALS["rest"], goal == GOALS["hold"]
-    phase_time, s, w = (values[motion.count] for values in (motion.phase_time, motion.s, motion.w))
-    speed = jnp.sqrt(ARRIVAL_SPEED_FACTOR * jnp.asarray(arrival, s.dtype))
-    near = jnp.abs(dynamics.breakpoints[-1] - s) <= arrival * dynamics.length
-    slow = w <= speed * dynamics.length
-    late = phase_time >= 1 - speed
-    ended = motion.status
-    there = (ended == Status.LEFT_FORMATION) | (ended == Status.OK)
-    held = (ended == Status.STUCK) | ((ended == Status.REVERSED) & late)
-    arrived = near & (there | held) & (slow | ~at_rest)
-    finish = jnp.where(arrived, int(Status.OK), jnp.where(ended == Status.OK, int(Status.NOT_REACHED), ended))
-    stayed = motion.at_rest[0] & (motion.phase_time[1] >= 1)
-    departs = jnp.where(motion.at_rest[0], motion.phase_time[1], 0.0)
-    moved = (ended == Status.REVERSED) | (ended == Status.AMBIGUOUS)
-    kept = jnp.where(stayed, int(Status.OK), jnp.where(moved & (phase_time <= departs), ended, int(Status.NOT_REACHED)))
-    finish, phase_time = jnp.where(holds, kept, finish), jnp.where(holds, departs, phase_time)
-    lost = jnp.isfinite(margin_result.loss_time) & ~holds
-    status = jnp.where(lost, int(Status.CONTACT_LOST), finish)
-    traced = dynamics.status == 0
-    room = force_slack(dynamics, entered.impulse)  # impulses have the cones of forces
-    pulls = room.min() < -IMPULSE_ROUNDING * entered.size
-    back = entered.speed < 0
-    refused = pulls | back
-    early = jnp.where(pulls, int(Status.CONTACT_LOST), int(Status.REVERSED))
-    contact = jnp.where(pulls, jnp.argmin(room), jnp.where(lost & ~back, margin_result.loss_contact, -1))
-    return Assessment(
-        status=jnp.where(traced, jnp.where(refused, early, status), dynamics.status),
-        phase_time=jnp.where(traced & ~refused, jnp.where(lost, margin_result.loss_time, phase_time), 0.0),
-        contact=jnp.where(traced, contact, -1),
+    holds = goal == GOALS["hold"]
+    slack = force_slack(dynamics, impact.impulse)  # impulses have the cones of forces
+    pulls = slack.min() < -IMPULSE_ROUNDING * impact.size
+    contact_lost, end_time = int(Status.CONTACT_LOST), motion.phase_time[motion.count]
+    is_lost = jnp.isfinite(margin_result.loss_time) & ~holds
+    hold_status, departure_time = _assess_hold(motion)
+    arrival_status = _assess_arrival(dynamics, motion, goal == GOALS["rest"], arrival)
+    rows = (  # condition, status, phase time, contact
+        (dynamics.status != int(Status.OK), dynamics.status, 0.0, -1),
+        (pulls, contact_lost, 0.0, jnp.argmin(slack)),
+        (impact.speed < 0, int(Status.REVERSED), 0.0, -1),
+        (is_lost, contact_lost, margin_result.loss_time, margin_result.loss_contact),
+        (holds, hold_status, departure_time, -1),
     )
+    conditions, statuses, times, contacts = zip(*rows, strict=True)
+    return Assessment(
+        status=jnp.select(conditions, statuses, arrival_status),
+        phase_time=jnp.select(conditions, times, end_time),
+        contact=jnp.select(conditions, contacts, -1),
+    )
+
+
+def _assess_arrival(dynamics: PathDynamics, motion: Motion, at_rest, arrival) -> Int[Array, ""]:
+    """Decide the status of a phase that moves the object to its path's end, `at_rest` or at any speed."""
+    phase_time, s, w = (values[motion.count] for values in (motion.phase_time, motion.s, motion.w))
+    max_speed = jnp.sqrt(ARRIVAL_SPEED_FACTOR * jnp.asarray(arrival, s.dtype))
+    is_near = jnp.abs(dynamics.breakpoints[-1] - s) <= arrival * dynamics.length
+    is_slow = w <= max_speed * dynamics.length
+    is_late = phase_time >= 1 - max_speed
+    ended = motion.status
+    reached = (ended == Status.LEFT_FORMATION) | (ended == Status.OK)
+    stopped = (ended == Status.STUCK) | ((ended == Status.REVERSED) & is_late)
+    arrived = is_near & (reached | stopped) & (is_slow | ~at_rest)
+    failure = jnp.where(ended == Status.OK, int(Status.NOT_REACHED), ended)
+    return jnp.where(arrived, int(Status.OK), failure)
+
+
+def _assess_hold(motion: Motion) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """Decide the status of a phase that holds the object, and the time at which the object departs."""
+    first_end = motion.phase_time[1]
+    departure_time = jnp.where(motion.at_rest[0], first_end, 0.0)
+    stayed = motion.at_rest[0] & (first_end >= 1)
+    moved_back = (motion.status == Status.REVERSED) | (motion.status == Status.AMBIGUOUS)
+    at_departure = moved_back & (motion.phase_time[motion.count] <= departure_time)
+    failure = jnp.where(at_departure, motion.status, int(Status.NOT_REACHED))
+    return jnp.where(stayed, int(Status.OK), failure), departure_time
