@@ -9,7 +9,8 @@ import numpy as np
 
 import wholearm_jax as wa
 from wholearm_jax.model.scene import polygon
-from wholearm_jax.phases.phase import _simulate_phase, trace_phase
+from wholearm_jax.phases.phase_simulation import _simulate_phase
+from wholearm_jax.phases.phase_tracing import trace_phase
 
 PACKAGE = Path(wa.__file__).parent
 ORDER = (

@@ -26,7 +26,8 @@ from wholearm_jax.files.polygons_npz import how_many, read_polygons
 from wholearm_jax.files.scene_toml import SceneError, to_dict
 from wholearm_jax.model.outline import find_defect
 from wholearm_jax.model.schedule import TorqueSchedule, pad_schedule
-from wholearm_jax.phases.plan import has_torque_jumps, trace_paths_in_one_program
+from wholearm_jax.phases.plan_schedule import has_torque_jumps
+from wholearm_jax.phases.plan_tracing import trace_paths_in_one_program
 
 pytest.importorskip("zarr")
 ARRIVAL, SEED, COUNT = 0.02, 3, 6

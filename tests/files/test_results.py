@@ -14,7 +14,7 @@ from wholearm_jax.core.status import Status
 from wholearm_jax.files.results import read_torque, summary, write_summary, write_torque, write_trajectory
 from wholearm_jax.files.scene_toml import SceneError, load, parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
-from wholearm_jax.phases.plan import simulate
+from wholearm_jax.phases.plan_simulation import simulate
 
 HEADER = (
     "t,phase,x,y,phi,theta1,theta2,x_dot,y_dot,phi_dot,theta1_dot,theta2_dot,tau1,tau2,cn1,cn2,cn3,cn4,ct1,ct2,ct3,ct4"

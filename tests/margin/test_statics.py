@@ -15,7 +15,8 @@ from wholearm_jax.margin.statics import contact_statics, rest_margin
 from wholearm_jax.model.scene import replace_duration
 from wholearm_jax.model.schedule import pad_schedule
 from wholearm_jax.optimisation.rest_transition import RestTransition, holding_schedule
-from wholearm_jax.phases.phase import simulate_phase, statics_at_start
+from wholearm_jax.phases.phase_ends import statics_at_start
+from wholearm_jax.phases.phase_simulation import simulate_phase
 from wholearm_jax.simulation.integrator import IntegratorOptions
 
 HALF, MASS, MU, DRY, LIMIT = 0.03, 0.2, 0.3, 0.01, 1.0

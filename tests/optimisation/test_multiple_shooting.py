@@ -13,7 +13,7 @@ from wholearm_jax.model.schedule import restrict_to_phase
 from wholearm_jax.optimisation.interior_point import retract
 from wholearm_jax.optimisation.linearisation import Limits
 from wholearm_jax.optimisation.multiple_shooting import Variables, interval_inputs, simulate_intervals
-from wholearm_jax.phases.plan import trace
+from wholearm_jax.phases.plan_tracing import trace
 from wholearm_jax.simulation.integrator import IntegratorOptions
 from wholearm_jax.simulation.phase_motion import simulate_motion
 

@@ -14,7 +14,7 @@ from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.optimisation.interior_point import DEFECT_TOL, MU_MIN
 from wholearm_jax.optimisation.solver import CONVERGED
 from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL
-from wholearm_jax.phases.plan import simulate
+from wholearm_jax.phases.plan_simulation import simulate
 
 # Largest minimum force [N] that direct collocation reached on the same plans at 1 s a phase, equal to the bound.
 BOUNDS = {"heptagon": (0.966, 0.838), "hexagon": (0.694, 1.830)}

@@ -10,7 +10,7 @@ from wholearm_jax.dynamics.path_dynamics import evaluate, locate_panel
 from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.model.scene import replace_duration
 from wholearm_jax.optimisation.rest_transition import MIN_REST_MARGIN, Moving, ReachableTorque, Resting, rest_transition
-from wholearm_jax.phases.phase import statics_at_start
+from wholearm_jax.phases.phase_ends import statics_at_start
 
 RATE = 2.0
 LEAD = 0.25

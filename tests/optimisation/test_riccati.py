@@ -11,7 +11,7 @@ from wholearm_jax.optimisation.coupled_phases import stacked_tables
 from wholearm_jax.optimisation.linearisation import Limits, linearise
 from wholearm_jax.optimisation.multiple_shooting import Variables
 from wholearm_jax.optimisation.riccati import SPREAD, kkt_step, project_step
-from wholearm_jax.phases.plan import trace
+from wholearm_jax.phases.plan_tracing import trace
 from wholearm_jax.simulation.integrator import IntegratorOptions
 
 KNOTS = 7

@@ -13,8 +13,8 @@ from wholearm_jax.model.mechanics import scaled_mechanics
 from wholearm_jax.model.scene import path_target as wa_heading
 from wholearm_jax.model.scene import rigid_body
 from wholearm_jax.optimisation.optimiser import MIN_TRANSITION_SPEED
-from wholearm_jax.phases import plan
-from wholearm_jax.phases.phase import start_configuration
+from wholearm_jax.phases import has_torque_jumps, simulate_phases
+from wholearm_jax.phases.phase_ends import start_configuration
 from wholearm_jax.simulation.integrator import IntegratorOptions
 
 FLIGHTS = ("flight", "passage")
@@ -91,12 +91,12 @@ def test_derivatives_pass_through_the_changes(flown):
 
     def options(adjoint):  # a change that comes early leaves two rows of one time within the next phase
         return IntegratorOptions(
-            tolerance=1e-13, max_steps=512, has_jumps=plan.has_torque_jumps(scene, torque), adjoint=adjoint
+            tolerance=1e-13, max_steps=512, has_jumps=has_torque_jumps(scene, torque), adjoint=adjoint
         )
 
     def end(amount, adjoint="none"):
         schedule = wa.TorqueSchedule(torque.times, base + amount * way)
-        found = plan.simulate_phases(scene, schedule, traced, options(adjoint))
+        found = simulate_phases(scene, schedule, traced, options(adjoint))
         second = found[1]
         return jnp.stack([second.start, second.impact.speed, second.margin_result.margin, *second.impact.impulse])
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.phases.gradient_check import DirectionalDerivative, _steadiest, check_gradient
+from wholearm_jax.phases.gradients import DirectionalDerivative, _most_stable, check_gradient
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +50,6 @@ def test_a_plan_without_a_margin_has_no_slopes(slide):
 
 
 def test_a_step_without_a_margin_tells_nothing():
-    assert _steadiest([math.nan, 1.0, 1.1, 1.1001]) == (pytest.approx(1e-4), 1.1001)
-    change, best = _steadiest([math.nan, 1.0, math.inf])
+    assert _most_stable([math.nan, 1.0, 1.1, 1.1001]) == (pytest.approx(1e-4), 1.1001)
+    change, best = _most_stable([math.nan, 1.0, math.inf])
     assert DirectionalDerivative("hand", 1e-8, 1.0, 1.0, best, change).finding == "unsure"

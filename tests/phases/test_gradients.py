@@ -11,8 +11,9 @@ from support import steadiest_difference
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.phases.compressive_margin import plan_margin
 from wholearm_jax.phases.gradients import MAX_FORWARD_DIRECTIONS, choose_mode, torque_gradient
-from wholearm_jax.phases.plan import plan_margin, simulate_phases
+from wholearm_jax.phases.plan_simulation import simulate_phases
 
 DATA = Path(__file__).parents[1] / "data"
 

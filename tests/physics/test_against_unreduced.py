@@ -13,7 +13,8 @@ from support import DURATION, passing
 import wholearm_jax
 from wholearm_jax.files import scene_toml as scene_file
 from wholearm_jax.margin import quasistatic as squeeze
-from wholearm_jax.phases.phase import configuration, simulate_phase, start_configuration
+from wholearm_jax.phases.phase_ends import configuration, start_configuration
+from wholearm_jax.phases.phase_simulation import simulate_phase
 from wholearm_jax.phases.sampling import sample_phase
 from wholearm_jax.simulation.integrator import IntegratorOptions
 

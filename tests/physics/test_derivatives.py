@@ -11,8 +11,8 @@ import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.margin.contact_forces import minimum_margin
 from wholearm_jax.model.schedule import TorqueSchedule, restrict_to_phase
+from wholearm_jax.phases.compressive_margin import margin
 from wholearm_jax.phases.gradients import torque_gradient
-from wholearm_jax.phases.plan import margin
 from wholearm_jax.simulation.integrator import IntegratorOptions
 from wholearm_jax.simulation.phase_motion import simulate_motion
 

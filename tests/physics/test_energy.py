@@ -8,7 +8,7 @@ from support import DURATION, passing
 import wholearm_jax
 from wholearm_jax.model.kinematics import contact_set, tangential_jacobian
 from wholearm_jax.model.scene import rigid_body
-from wholearm_jax.phases.phase import simulate_phase
+from wholearm_jax.phases.phase_simulation import simulate_phase
 from wholearm_jax.phases.sampling import sample_phase
 from wholearm_jax.simulation.integrator import IntegratorOptions
 

@@ -19,8 +19,9 @@ from wholearm_jax.model.kinematics import contact_kinematics, gaps
 from wholearm_jax.model.mechanics import scaled_mechanics
 from wholearm_jax.model.scene import rigid_body
 from wholearm_jax.model.schedule import restrict_to_phase
-from wholearm_jax.phases.phase import describe_end, trace_phase
-from wholearm_jax.phases.plan import simulate_phases
+from wholearm_jax.phases.phase_ends import describe_end
+from wholearm_jax.phases.phase_tracing import trace_phase
+from wholearm_jax.phases.plan_simulation import simulate_phases
 from wholearm_jax.phases.sampling import sample_phase
 from wholearm_jax.simulation.integrator import IntegratorOptions
 from wholearm_jax.simulation.phase_motion import simulate_motion

@@ -23,7 +23,7 @@ from wholearm_jax.model.kinematics import (
 )
 from wholearm_jax.model.scene import contact_formation, rigid_body
 from wholearm_jax.model.schedule import TorqueSchedule
-from wholearm_jax.phases.phase import simulate_phase
+from wholearm_jax.phases.phase_simulation import simulate_phase
 from wholearm_jax.phases.sampling import sample_phase
 from wholearm_jax.simulation.integrator import IntegratorOptions
 

@@ -7,7 +7,7 @@ import pytest
 
 from wholearm_jax.files.scene_toml import load, parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
-from wholearm_jax.phases.plan import simulate
+from wholearm_jax.phases.plan_simulation import simulate
 from wholearm_jax.plotting.palette import CONTACT_COLOURS, DASHES, contact_styles
 from wholearm_jax.plotting.plan_figures import (
     COLUMN,

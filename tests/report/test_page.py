@@ -10,7 +10,7 @@ import pytest
 from wholearm_jax.files.results import summary, write_summary, write_torque, write_trajectory
 from wholearm_jax.files.scene_toml import SceneError, load, parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
-from wholearm_jax.phases.plan import simulate
+from wholearm_jax.phases.plan_simulation import simulate
 from wholearm_jax.report.page import _worst, read_result, render, report
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

@@ -12,7 +12,8 @@ from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.model.kinematics import gaps, normal_jacobian, tangential_jacobian
 from wholearm_jax.model.mechanics import scaled_mechanics
 from wholearm_jax.model.scene import rigid_body
-from wholearm_jax.phases.phase import describe_end, trace_phase
+from wholearm_jax.phases.phase_ends import describe_end
+from wholearm_jax.phases.phase_tracing import trace_phase
 from wholearm_jax.tracing.path import Resolution, _distribute_panels
 
 ENDS = {

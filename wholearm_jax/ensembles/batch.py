@@ -125,7 +125,9 @@ def _check_chunk(
             break
     assert results is not None
     for row in np.concatenate([*single, rows]):
-        result = simulate(source.draw(numbers[row]), torque, arrival=float(arrival))  # refines until all is fine
+        result = simulate(
+            source.draw(jnp.asarray(numbers[row])), torque, arrival=float(arrival)
+        )  # refines until all is fine
         _overwrite(results, row, from_result(result))
     return results
 

@@ -99,7 +99,7 @@ def _certify_rests(
     return jnp.stack(certified).all()
 
 
-def _arrival_penalty(simulated: SimulatedPhase, dynamics: PathDynamics, arrive: str, arrival) -> Float[Array, ""]:
+def _arrival_penalty(simulated: SimulatedPhase, dynamics: PathDynamics, arrive: str, arrival):
     """Penalise the distance and speed with which a phase misses its end; logarithmic, lest the worst sample rule."""
     last = simulated.motion.count
     misses = [jnp.abs(dynamics.breakpoints[-1] - simulated.motion.s[last]) / dynamics.length / arrival]

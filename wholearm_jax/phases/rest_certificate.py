@@ -23,7 +23,7 @@ from wholearm_jax.model import (
     restrict_to_phase,
     torque_at,
 )
-from wholearm_jax.phases.phase import SimulatedPhase
+from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.result import MIN_REST
 from wholearm_jax.simulation import Motion
 

@@ -11,7 +11,9 @@ import numpy as np
 from wholearm_jax.core import Status
 from wholearm_jax.margin import RestInterval, contact_statics, rest_margin
 from wholearm_jax.model import Phase, Scene, TorqueSchedule
-from wholearm_jax.phases.phase import SimulatedPhase, TracedPhase, configuration
+from wholearm_jax.phases.phase_ends import configuration
+from wholearm_jax.phases.phase_simulation import SimulatedPhase
+from wholearm_jax.phases.phase_tracing import TracedPhase
 
 SLIP_TOL = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
 MIN_REST = 1e-9  # share of a phase: an object that comes to rest at its end does so earlier or later by rounding

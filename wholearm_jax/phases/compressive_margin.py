@@ -1,0 +1,60 @@
+"""Compressive margin of a plan as one differentiable number."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from wholearm_jax.model import Scene, TorqueSchedule
+from wholearm_jax.phases.phase_simulation import SimulatedPhase
+from wholearm_jax.phases.plan_schedule import has_torque_jumps, with_plan_step_capacity
+from wholearm_jax.phases.plan_simulation import simulate_phases
+from wholearm_jax.phases.plan_tracing import trace
+from wholearm_jax.simulation import IntegratorOptions
+from wholearm_jax.tracing import Resolution
+
+
+def margin(
+    scene: Scene,
+    torque: TorqueSchedule,
+    *,
+    options: IntegratorOptions = IntegratorOptions(adjoint="both"),
+    resolution: Resolution = Resolution(),
+) -> Float[Array, ""]:
+    """Compute the compressive margin of a plan, formations assumed to hold.
+
+    It is the minimum over time and contacts of `c_n` and, for contacts that roll, of `mu c_n - |c_t|`: the paper's
+    `c_n > 0` (section 2.2; derivation, sections 4 and 7). Phases that hold the object do not count. Differentiable, in
+    forward and reverse mode, with respect to the torques and every float of the scene. In float32 it has four digits
+    (`docs/accuracy.md`).
+
+    Args:
+        scene: Scene with its plan.
+        torque: Schedule that covers the plan.
+        options: Integrator options. Jumps of the schedule within a phase are found where its times and the durations
+            are numbers; where they are transformed, set `has_jumps`.
+        resolution: Sizes of the paths and their tables.
+
+    Returns:
+        The margin [N]: negative where a contact would pull, `-inf` where a phase has no motion or no path. Whether the
+        plan succeeds is for `simulate` to say.
+
+    >>> scene = wa.load("heptagon")
+    >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")
+    0.70 N
+    """
+    jumps = options.has_jumps or has_torque_jumps(scene, torque)
+    options = replace(with_plan_step_capacity(options, scene, torque), has_jumps=jumps)
+    return plan_margin(scene, simulate_phases(scene, torque, trace(scene, resolution=resolution), options))
+
+
+def plan_margin(scene: Scene, simulated: tuple[SimulatedPhase, ...]) -> Float[Array, ""]:
+    """Return the smallest margin [N] of simulated phases, those that hold left out; `-inf` where one has no motion.
+
+    Raises ValueError for a plan that only holds its object.
+    """
+    pairs = zip(simulated, scene.phases, strict=True)
+    margins = [s.margin_result.margin for s, phase in pairs if phase.arrive != "hold"]
+    if not margins:
+        raise ValueError("a plan that only holds its object has no margin of a motion, see Result.hold_margin")
+    return jnp.stack([jnp.where(jnp.isfinite(m), m, -jnp.inf) for m in margins]).min()

@@ -1,0 +1,64 @@
+"""Where a phase begins and ends: configurations on its path, statics at its start, and why it ends, in words."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
+from wholearm_jax.margin import RestAccelerations, Statics, contact_statics
+from wholearm_jax.model import FEATURE_GROUPS, FINGER_ROOT, PALM_END, Phase, Scene, contact_name
+from wholearm_jax.phases.phase_tracing import TracedPhase
+from wholearm_jax.simulation import Motion
+from wholearm_jax.tracing import LEFT, MADE, UNTIL
+
+
+@jax.jit
+def configuration(dynamics: PathDynamics, segment: Int[Array, ""], s: Float[Array, ""]) -> Float[Array, "5"]:
+    """Return `z` (SI) at the path parameter `s` of a segment."""
+    panel, xi = locate_panel(dynamics, segment, s)
+    return evaluate(dynamics.configuration, panel, xi)
+
+
+@jax.jit
+def start_configuration(dynamics: PathDynamics) -> Float[Array, "5"]:
+    """Return `z` (SI) at the path's start."""
+    return configuration(dynamics, jnp.asarray(0, int), dynamics.breakpoints[0])
+
+
+def final_configuration(dynamics: PathDynamics, motion: Motion) -> Float[Array, "5"]:
+    """Return `z` (SI) at the end of a motion."""
+    return configuration(dynamics, motion.segment[jnp.maximum(motion.count - 1, 0)], motion.s[motion.count])
+
+
+def target_configuration(phase: Phase, traced: TracedPhase) -> Float[Array, "5"]:
+    """Return `z` (SI) where a phase should end: at its path's end, or where it began if it holds the object."""
+    return traced.begin if phase.arrive == "hold" else traced.end
+
+
+def statics_at_start(scene: Scene, phase: Phase, traced: TracedPhase) -> tuple[Statics, RestAccelerations]:
+    """Return the statics at a phase's start, and the accelerations with which the object would depart from there."""
+    dynamics = traced.dynamics
+    panel, xi = locate_panel(dynamics, jnp.asarray(0, int), dynamics.breakpoints[0])
+    forward, backward = jax.device_get(
+        (evaluate(dynamics.acceleration, panel, xi), evaluate(dynamics.reverse_acceleration, panel, xi))
+    )
+    statics = contact_statics(scene, phase.formation, traced.begin)
+    return statics, RestAccelerations(forward[[0, 3, 4]], backward)
+
+
+def describe_end(traced: TracedPhase, phase: Phase, capacity: int) -> str:
+    """Say why a phase ends; `capacity` is the number of rows of the object's vertices."""
+    if phase.arrive == "hold":
+        return "the object is held"
+    reason, index = int(traced.path.end_reason), int(traced.path.end_contact)
+    if reason == MADE:
+        group, feature = divmod(index, capacity)
+        link, kind = FEATURE_GROUPS[group]
+        if kind == FINGER_ROOT:
+            return f"e{feature} meets finger{link}'s root"
+        if kind == PALM_END:
+            return f"e{feature} meets the palm's end at finger{link}"
+        return f"{contact_name(link, kind, feature)} is made"
+    if reason == LEFT:
+        return f"{phase.formation.names[phase.formation.contact_of_row[index]]} leaves its feature"
+    return "the phase's own limit is reached" if reason == UNTIL else "no end was found"

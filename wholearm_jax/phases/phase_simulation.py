@@ -1,0 +1,108 @@
+"""Simulation of one phase: its motion under a torque schedule, the margin of that motion, and its assessment.
+
+One compiled program (`_simulate_phase`) serves every phase of every scene.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from wholearm_jax.core import Program, Status, as_device_array, as_strong_array
+from wholearm_jax.dynamics import Impact, PathDynamics, evaluate, locate_panel, placeholder_dynamics, resolve_impact
+from wholearm_jax.margin import MarginResult, minimum_margin
+from wholearm_jax.model import TorqueSchedule, restrict_to_phase, uniform_schedule
+from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL, GOALS, Assessment, assess_phase
+from wholearm_jax.phases.phase_tracing import MIN_LENGTH
+from wholearm_jax.simulation import IntegratorOptions, Motion, simulate_motion, tolerance_as_data
+from wholearm_jax.tracing import Resolution
+
+
+class SimulatedPhase(NamedTuple):
+    """A simulated phase, as arrays."""
+
+    start: Float[Array, ""]  # [s], from the plan's start
+    duration: Float[Array, ""]  # [s] available
+    impact: Impact  # at which the phase is entered
+    motion: Motion
+    margin_result: MarginResult
+    assessment: Assessment
+    exit_velocity: Float[Array, "5"]  # `z_dot` (SI) at the end of the motion
+
+
+def simulate_phase(
+    dynamics: PathDynamics,
+    schedule: TorqueSchedule,
+    start,
+    duration,
+    options: IntegratorOptions,
+    goal,
+    incoming_velocity=None,
+    arrival=DEFAULT_ARRIVAL,
+) -> SimulatedPhase:
+    """Simulate one phase from its path's start, compute its margin, and assess how it ends.
+
+    Args:
+        dynamics: Tabulated path dynamics.
+        schedule: Torque schedule of the whole plan.
+        start: Time at which the phase begins [s].
+        duration: Time that it has [s].
+        options: Integrator options.
+        goal: How the phase must end: a word of `Phase.arrive`, or a number of `GOALS`.
+        incoming_velocity: `z_dot` (SI) at the end of the phase before, for a transition while moving (None: at rest).
+        arrival: Distance from the path's end within which the phase must end, in path lengths.
+    """
+    dtype = dynamics.breakpoints.dtype
+    incoming_velocity = np.zeros(5) if incoming_velocity is None else incoming_velocity
+    start, duration, incoming_velocity, arrival = (
+        as_strong_array(a, dtype) for a in (start, duration, incoming_velocity, arrival)
+    )
+    options = tolerance_as_data(options, dtype)
+    goal = as_strong_array(GOALS[goal] if isinstance(goal, str) else goal, int)
+    return _simulate_phase(dynamics, schedule, start, duration, incoming_velocity, options, goal, arrival)
+
+
+@Program
+def _simulate_phase(
+    dynamics: PathDynamics,
+    schedule: TorqueSchedule,
+    start,
+    duration,
+    incoming_velocity,
+    options: IntegratorOptions,
+    goal,
+    arrival,
+) -> SimulatedPhase:
+    """Simulate, score and assess one phase; see `simulate_phase`."""
+    # Enter the phase and integrate its motion.
+    phase_schedule = restrict_to_phase(schedule, start, duration)
+    impact = resolve_impact(dynamics, incoming_velocity)
+    motion = simulate_motion(dynamics, phase_schedule, duration, options=options, speed=jnp.maximum(impact.speed, 0.0))
+    # Compute the margin: unknown for part of a motion, and without a path. A path whose start lies beyond an edge of
+    # its formation, be it by rounding, is as good as any beside it.
+    margin_result = minimum_margin(dynamics, phase_schedule, duration, motion, options)
+    starts_beyond = (dynamics.status == int(Status.LEFT_FORMATION)) & (dynamics.length > MIN_LENGTH)
+    has_path = (dynamics.status == int(Status.OK)) | starts_beyond
+    is_known = has_path & (motion.status != int(Status.MAX_STEPS))
+    margin = jnp.where(is_known, margin_result.margin, -jnp.inf)
+    margin_result = eqx.tree_at(lambda r: r.margin, margin_result, margin)
+    # Assess the end, and evaluate the velocity there.
+    assessment = assess_phase(dynamics, motion, margin_result, goal, impact, arrival)
+    last = jnp.maximum(motion.count - 1, 0)
+    panel, xi = locate_panel(dynamics, motion.segment[last], motion.s[motion.count])
+    exit_velocity = evaluate(dynamics.velocity, panel, xi) * motion.w[motion.count] / duration
+    return SimulatedPhase(start, duration, impact, motion, margin_result, assessment, exit_velocity)
+
+
+def precompile_simulation(rows: int, options: IntegratorOptions) -> None:
+    """Compile `simulate_phase` for schedules of `rows` rows, by a call on a placeholder of the usual size."""
+    simulate_phase(
+        placeholder_dynamics(Resolution()),
+        uniform_schedule(1.0, np.zeros((rows, 2))),
+        as_device_array(0.0),
+        as_device_array(1.0),
+        options,
+        "rest",
+    )

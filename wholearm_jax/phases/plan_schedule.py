@@ -1,0 +1,52 @@
+"""A torque schedule against a plan: what the plan requires of it, its jumps, and the steps that it needs."""
+
+import numpy as np
+
+from wholearm_jax.core import is_transformed
+from wholearm_jax.model import Scene, TorqueSchedule, has_jumps
+from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
+
+
+def require_motion(scene: Scene) -> None:
+    """Raise ValueError for a plan with a phase that holds the object, where only phases that move it make sense."""
+    for phase in scene.phases:
+        if phase.arrive == "hold":
+            raise ValueError(f"phase '{phase.name}' holds the object; this is for phases that move it")
+
+
+def require_covered(scenes: Scene, torque: TorqueSchedule) -> None:
+    """Raise ValueError for a schedule that is shorter than the plan, or than the longest plan of stacked scenes."""
+    total = float(np.max(sum(np.asarray(p.duration) for p in scenes.phases)))
+    first, last = float(torque.times[0]), float(torque.times[-1])
+    if first > 0 or last < total * (1 - 1e-9):
+        raise ValueError(f"the torque schedule covers {first:g} to {last:g} s, the plan 0 to {total:g} s")
+
+
+def with_plan_step_capacity(options: IntegratorOptions, scene: Scene, torque: TorqueSchedule) -> IntegratorOptions:
+    """Add capacity for the steps that a schedule's rows require within a phase.
+
+    Counted are the rows within a phase, or all where times or durations are being transformed.
+    """
+    rows = torque.times.shape[0]
+    if not is_transformed(torque.times, [phase.duration for phase in scene.phases]):
+        ends = np.cumsum([0.0, *(float(phase.duration) for phase in scene.phases)])
+        rows = int(np.max(np.diff(np.searchsorted(np.asarray(torque.times), ends))))
+    return with_step_capacity(options, rows)
+
+
+def has_torque_jumps(scenes: Scene, torque: TorqueSchedule) -> bool:
+    """Say whether a schedule jumps within a phase of a scene, or of one of stacked scenes.
+
+    False where times or durations are being transformed.
+    """
+    if is_transformed(torque.times, [phase.duration for phase in scenes.phases]):
+        return False
+    ends = np.cumsum([np.asarray(phase.duration) for phase in scenes.phases], axis=0)
+    first = 0.0
+    for before, phase, end in zip([None, *scenes.phases], scenes.phases, ends, strict=False):
+        # A phase that is left while moving may end early: then the next phase has its remaining torques.
+        if before is None or before.arrive != "moving":
+            first = float(np.min(end - np.asarray(phase.duration)))
+        if has_jumps(torque, first, float(np.max(end))):
+            return True
+    return False
