@@ -110,7 +110,7 @@ def rank_correlations(
     if len(margins) > 1 and np.any(margins != margins[0]):
         for k, column in enumerate(offsets.T):
             if np.ptp(column) > 0:
-                correlations[k] = spearmanr(margins, column)[0]
+                correlations[k] = np.asarray(spearmanr(margins, column))[0]
     return correlations
 
 

@@ -1,8 +1,8 @@
 """Simulation of a plan: its phases one after the other under a torque schedule.
 
 Each phase starts where the path of the phase before it ended: at rest at the planned time or, where that phase arrives
-`moving`, at the moment of the transition, with the speed that the impact leaves (`dynamics.resolve_impact`). It has time
-until its planned end.
+`moving`, at the moment of the transition, with the speed that the impact leaves (`dynamics.resolve_impact`). It has
+time until its planned end.
 """
 
 from functools import partial
