@@ -1,101 +1,187 @@
-"""The package is read top to bottom: each module imports only from those above it; shapes decide what compiles."""
+"""The package is read top to bottom: who imports whom, what loads when; shapes decide what compiles."""
 
 import ast
+import re
+import subprocess
+import sys
+from collections import defaultdict
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.model.scene import polygon
+from wholearm_jax.model import polygon
 from wholearm_jax.phases.phase_simulation import _simulate_phase
 from wholearm_jax.phases.phase_tracing import trace_phase
 
 PACKAGE = Path(wa.__file__).parent
-ORDER = (
-    *(
-        "status",
-        "settings",
-        "precision",
-        "requirements",
-        "lookup",
-        "outline",
-        "scene",
-        "contacts",
-        "system",
-        "elimination",
-        "newton",
-        "writing",
-        "programs",
-    ),
-    *("watch", "march", "start", "places", "wire", "reduction"),
-    *("schedule", "stepping", "landing", "motion", "forces", "verdict", "holding"),
-    *("phase", "result", "resting", "sampling", "plan", "gradient", "gradient_check"),
-    *("squeeze", "shooting", "linearisation", "recursion", "descent", "pacing"),
-    *("formations", "guesses", "handover", "group", "optimiser", "baseline"),
-    *("variation", "batch", "robust", "proportion", "survey"),
-    *("free_bodies", "coulomb", "execution", "perturbation"),
-    *("scene_file", "result_file", "store", "polygon_file", "palette", "report"),
-    *("drawing", "execution_drawing", "survey_drawing", "__init__"),
-    *("arguments", "finishing", "batch_command", "robust_command", "execution_command", "command"),
+CORE = ("core",)
+GEOMETRY = (*CORE, "model")
+PATHS = (*GEOMETRY, "tracing")
+MOTIONS = (*PATHS, "dynamics", "simulation")
+PLANS = (*MOTIONS, "margin", "phases")
+MANY = (*PLANS, "optimisation", "planning", "feedback", "ensembles")
+ABOVE = {
+    "core": (),
+    "model": CORE,
+    "tracing": GEOMETRY,
+    "dynamics": PATHS,
+    "simulation": (*PATHS, "dynamics"),
+    "margin": MOTIONS,
+    "phases": (*MOTIONS, "margin"),
+    "optimisation": PLANS,
+    "planning": PLANS,
+    "feedback": PLANS,
+    "ensembles": MANY,
+    "execution": (*GEOMETRY, "phases", "feedback", "ensembles"),
+    "files": (*GEOMETRY, "phases", "planning", "feedback", "ensembles"),
+    "plotting": (*GEOMETRY, "phases", "planning", "feedback", "ensembles", "files"),
+    "report": (*GEOMETRY, "files", "plotting"),
+    "cli": (*MANY, "execution", "files", "plotting", "report"),
+}
+"""Which folders each folder may import from (`docs/architecture.md`)."""
+FOR_TYPES = {"files": ("execution",), "plotting": ("execution", "optimisation")}
+"""Which more for annotations alone, under `TYPE_CHECKING`."""
+HEAVY = ("matplotlib", "mujoco", "zarr", "joblib", "jinja2", "rich")
+
+
+def sources(package=PACKAGE):
+    """Every file of the package with its tree."""
+    return {path: ast.parse(path.read_text()) for path in sorted(package.rglob("*.py"))}
+
+
+def imported(path, tree, package=PACKAGE):
+    """`(module, names, for types alone)` of all imports of the package's own modules, absolute or relative."""
+    guarded = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        for inner in ast.walk(node)
+    }
+    here = ("wholearm_jax", *path.relative_to(package).parent.parts)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found = [(alias.name, ()) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(here[: len(here) - node.level + 1]) if node.level else ""
+            found = [(".".join(filter(None, (base, node.module))), tuple(alias.name for alias in node.names))]
+        else:
+            continue
+        for module, names in found:
+            if module.partition(".")[0] == "wholearm_jax":
+                yield module, names, id(node) in guarded
+
+
+def upward(package=PACKAGE):
+    """Imports from folders that a file's own folder may not know, and how many imports were looked at."""
+    wrong, count = [], 0
+    for path, tree in sources(package).items():
+        folder = path.relative_to(package).parts[0]
+        if folder.endswith(".py"):
+            continue  # the root and `__main__` know all
+        for module, names, for_types in imported(path, tree, package):
+            others = [module.split(".")[1]] if "." in module else list(names)
+            count += len(others)
+            known = {folder, *ABOVE[folder], *(FOR_TYPES.get(folder, ()) if for_types else ())}
+            wrong += [f"{path.relative_to(package)} imports {other}" for other in others if other not in known]
+    return wrong, count
+
+
+def test_folders_import_only_from_those_above_them():
+    folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name not in ("__pycache__", "scenes")}
+    assert folders <= set(ABOVE)
+    assert len(sources()) > 90, "every file is looked at"
+    wrong, count = upward()
+    assert count > 400
+    assert not wrong, wrong
+
+
+@pytest.mark.parametrize(
+    "line", ["from wholearm_jax.cli import app", "import wholearm_jax.plotting", "from ..margin import force_slack"]
 )
+def test_an_upward_import_is_seen(tmp_path, line):
+    core = tmp_path / "core"
+    core.mkdir()
+    (core / "arrays.py").write_text("import jax\n")
+    assert upward(tmp_path)[0] == []
+    (core / "arrays.py").write_text(f"def late():\n    {line}\n")
+    assert len(upward(tmp_path)[0]) == 1
 
 
-def imports(path):
-    """Names of the package's own modules that a file imports anywhere in it."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("wholearm_jax"):
-            yield node.module.partition(".")[2] or "__init__"
+def test_modules_of_a_folder_do_not_import_one_another_in_circles():
+    followed = 0
+    for folder in ABOVE:
+        edges = defaultdict(set)
+        for path, tree in sources().items():
+            if path.parent != PACKAGE / folder or path.stem == "__init__":
+                continue
+            for module, names, for_types in imported(path, tree):
+                parts = module.split(".")
+                if len(parts) > 1 and parts[1] == folder and not for_types:
+                    assert len(parts) > 2 or all((path.parent / f"{n}.py").exists() for n in names), (
+                        f"{path.name} imports through its own folder"
+                    )
+                    edges[path.stem] |= {parts[2]} if len(parts) > 2 else set(names)
+        followed += sum(map(len, edges.values()))
+        left = {name: set(others) for name, others in edges.items()}
+        while left:
+            free = [name for name, others in left.items() if not others & set(left)]
+            assert free, f"{folder}: a circle among {sorted(left)}"
+            left = {name: others for name, others in left.items() if name not in free}
+    assert followed > 60
 
 
-def test_each_module_imports_only_from_those_above_it():
-    assert {p.stem for p in PACKAGE.glob("*.py")} == set(ORDER)
-    for place, name in enumerate(ORDER):
-        below = set(imports(PACKAGE / f"{name}.py")) - set(ORDER[:place])
-        assert not below, f"{name} imports {below} from below"
+def test_nothing_stands_beside_the_folders():
+    assert {p.name for p in PACKAGE.glob("*.py")} == {"__init__.py", "__main__.py"}
 
 
-def test_matplotlib_stays_in_the_drawing_modules_and_the_command_line():
-    for path in PACKAGE.glob("*.py"):
-        if path.stem not in (
-            "drawing",
-            "execution_drawing",
-            "survey_drawing",
-            "batch_command",
-            "execution_command",
-            "command",
-        ):
-            assert "matplotlib" not in path.read_text(), path.stem
+def test_heavy_libraries_stay_where_they_belong():
+    allowed = {
+        "matplotlib": ("plotting",),
+        "mujoco": ("execution",),
+        "zarr": ("files/check_store.py",),
+        "jinja2": ("report",),
+        "joblib": ("execution",),
+        "rich": ("cli",),
+    }
+    seen = set()
+    for path, tree in sources().items():
+        for node in ast.walk(tree):
+            modules = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            modules += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            for library in {module.partition(".")[0] for module in modules} & set(allowed):
+                seen.add(library)
+                place = str(path.relative_to(PACKAGE))
+                assert place.startswith(allowed[library]), f"{place} imports {library}"
+    assert seen == set(allowed)
 
 
-def test_mujoco_stays_in_the_modules_that_execute():
-    executing = {"free_bodies", "coulomb", "execution", "perturbation"}
-    for path in PACKAGE.glob("*.py"):
-        tree = ast.parse(path.read_text())
-        top = {name for node in tree.body if isinstance(node, ast.ImportFrom) for name in [(node.module or "")]}
-        assert not any(name.rpartition(".")[2] in executing for name in top) or path.stem in executing, path.stem
-        assert "import mujoco" not in path.read_text() or path.stem in executing, path.stem
+def test_importing_the_package_loads_no_heavy_library():
+    told = subprocess.run(
+        [sys.executable, "-c", f"import sys, wholearm_jax; print([m for m in {HEAVY} if m in sys.modules])"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert told.stdout.strip() == "[]"
 
 
-def test_the_public_interface_is_small():
-    assert len(wa.__all__) <= 20
+def test_the_public_interface_exists():
+    assert len(wa.__all__) == len(set(wa.__all__)) >= 20
     assert all(hasattr(wa, name) for name in wa.__all__)
 
 
 def test_scenes_of_one_size_share_their_programs():
     """Sliding and rolling contacts, five formations in all: trace, reduce and simulate compile once each."""
-    compiled = {}
-
-    def count(name, *_, **__):
-        compiled[name] = compiled.get(name, 0) + 1
-
+    compiled = set()
     for name in ("heptagon", "hexagon", "tipping"):
         scene = wa.load(name)
         with jax.log_compiles(False):
             wa.simulate(scene, wa.quasistatic(scene))
-        sizes = trace_phase.sizes(), _simulate_phase.sizes()
-        count(sizes)
+        compiled.add((trace_phase.sizes(), _simulate_phase.sizes()))
     assert len(compiled) == 1, f"a later scene compiled again: {compiled}"
 
 
@@ -116,3 +202,16 @@ def test_reading_scenes_and_schedules_compiles_nothing():
         assert "/jax/core/compile/backend_compile_duration" in compiled  # the listener hears what is compiled
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def test_docstrings_name_modules_that_exist():
+    """A doctest's exception paths and the script's entry are of today's layout."""
+    modules = {".".join(("wholearm_jax", *p.relative_to(PACKAGE).with_suffix("").parts)) for p in sources()}
+    modules |= {module.rpartition(".")[0] for module in modules} | {"wholearm_jax"}
+    named = 0
+    for path in sources():
+        for module in re.findall(r"\bwholearm_jax(?:\.[a-z_]+)+", path.read_text()):
+            named += 1
+            parts = module.split(".")
+            assert any(".".join(parts[:n]) in modules for n in (len(parts), len(parts) - 1)), f"{path.name}: {module}"
+    assert named > 100

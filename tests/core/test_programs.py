@@ -124,7 +124,7 @@ def test_what_cannot_be_named_is_not_kept(folder):
 
 @pytest.fixture
 def no_calls_beside(monkeypatch):
-    monkeypatch.setattr(programs, "_calls_beside", {})
+    monkeypatch.setattr(programs, "_background_calls", {})
 
 
 @pytest.mark.usefixtures("no_calls_beside")

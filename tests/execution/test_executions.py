@@ -394,7 +394,7 @@ def test_an_end_is_judged_by_place_angle_and_contacts(off, ending, predictions):
 @pytest.mark.parametrize(("creep", "why"), [(np.inf, "MuJoCo gave up"), (6e-4, "contacts crept 0.6 mm")])
 def test_a_simulation_that_diverges_is_said(creep, why, predictions, monkeypatch):
     honest = execution.run_schedule
-    monkeypatch.setattr(execution, "drive", lambda *a: (honest(*a)[0], creep))
+    monkeypatch.setattr(execution, "run_schedule", lambda *a: (honest(*a)[0], creep))
     done = execute(predictions["heptagon"], timestep=1e-3)
     assert done.ending is ExecutionOutcome.DIVERGED
     assert done.message.startswith(f"diverged ({why}: take a shorter time step), ")
@@ -497,8 +497,9 @@ def test_bad_options(more, cause, wholearm):
 
 def test_missing_extra_is_one_clear_line(wholearm, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    for name in ("free_bodies", "coulomb", "execution", "perturbation"):
-        monkeypatch.delitem(sys.modules, f"wholearm_jax.{name}", raising=False)
+    monkeypatch.delitem(sys.modules, "wholearm_jax.execution", raising=False)
+    for name in ("mujoco_model", "coulomb_friction", "executions", "trials"):
+        monkeypatch.delitem(sys.modules, f"wholearm_jax.execution.{name}", raising=False)
     code, out, err = wholearm("execute", "heptagon", *TORQUE)
     assert (code, out) == (2, "")
     assert err == "wholearm: execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'\n"

@@ -264,7 +264,9 @@ def test_a_dip_between_samples_is_found_among_many_low_steps(floor):
 def test_what_passes_and_comes_back_within_a_step_is_met_on_its_way_down(side):
     """A vertex that grazes a finger, or its back: it dips through soon, and is back to rounding where the step ends."""
     lower, upper = jnp.array([0.0, -jnp.inf]), jnp.array([1.0, jnp.inf])
-    watch = SimpleNamespace(lower=lower, upper=upper, counts=jnp.array([True, True]), behind=jnp.array([True, False]))
+    watch = SimpleNamespace(
+        lower=lower, upper=upper, is_terminal=jnp.array([True, True]), may_start_negative=jnp.array([True, False])
+    )
     step, inside = 2e-3, jnp.array([0.5, 0.0])
     gap = np.polynomial.Polynomial.fromroots([0.3 * step, 0.999999 * step])
     steady = jnp.array([1.0])  # some room that nothing changes
@@ -372,7 +374,7 @@ def test_too_few_steps_are_always_said():
     whole = simulate_motion(dynamics, phase_schedule, jnp.asarray(1.0), options=IntegratorOptions(), speed=4.0)
     needed = int(whole.count)
     assert needed > 9
-    short = jax.jit(simulate_motion, static_argnames=("how", "speed"))
+    short = jax.jit(simulate_motion, static_argnames=("options", "speed"))
     said = []
     for most in (*range(3, needed - 3, 3), *range(needed - 3, needed + 2)):  # each size is a program
         motion = short(dynamics, phase_schedule, jnp.asarray(1.0), options=IntegratorOptions(max_steps=most), speed=4.0)

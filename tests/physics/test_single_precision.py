@@ -16,7 +16,7 @@ import wholearm_jax as wa
 scene, torque = wa.load("heptagon"), wa.read_torque(sys.argv[1])
 traced = wa.trace(scene)
 print(traced[0].dynamics.breakpoints.dtype, *(int(one.dynamics.status) for one in traced))
-print(float(wa.margin(scene, torque, how=wa.IntegratorOptions(tolerance=1e-5))))
+print(float(wa.margin(scene, torque, options=wa.IntegratorOptions(tolerance=1e-5))))
 try:
     wa.simulate(scene, torque)
 except RuntimeError as error:

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import ending_at_its_kink
 
 import wholearm_jax as wa
 from wholearm_jax.dynamics.path_dynamics import evaluate, evaluate_dot, locate_panel
@@ -205,7 +206,7 @@ def at_places(dynamics, shares):
     def one(s):
         segment = jnp.minimum((s >= dynamics.breakpoints[1:-1]).sum(), dynamics.count - 1)
         panel, xi = locate_panel(dynamics, segment, s)
-        names = ("acceleration", "backward", "force", "configuration", "velocity")
+        names = ("acceleration", "reverse_acceleration", "force", "configuration", "velocity")
         return [evaluate(getattr(dynamics, name), panel, xi) for name in names]
 
     return jax.vmap(one)(dynamics.breakpoints[0] + shares * dynamics.length)

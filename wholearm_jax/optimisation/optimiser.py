@@ -175,7 +175,7 @@ def optimise(
     that are not positive.
 
     >>> found = wa.optimise(wa.load("heptagon"))
-    >>> found.result.status.label, [f"{share:.2f}" for share in found.reached]
+    >>> found.result.status.label, [f"{share:.2f}" for share in found.bound_fraction]
     ('ok', ['1.00', '1.00'])
     """
     require_x64()

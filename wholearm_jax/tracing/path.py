@@ -151,7 +151,7 @@ def placeholder_path(resolution: Resolution, contacts: int = 4) -> ContactPath:
         "panels": np.ones(segments, int),
         "segment_of_panel": np.zeros(panels, int),
     }
-    each |= {"count": 1, "status": int(Status.NO_CONVERGENCE), "end_why": NO_END, "end_contact": 0}
+    each |= {"count": 1, "status": int(Status.NO_CONVERGENCE), "end_reason": NO_END, "end_contact": 0}
     return ContactPath(**{name: as_device_array(value) for name, value in each.items()})
 
 
