@@ -128,7 +128,7 @@ def gradients(ensemble, torque) -> dict:
     """Checks with the gradient with respect to all torques, a block at a time."""
     schedule, options = pad_schedule(torque), COARSE_PASS.options
     level = COARSE_PASS._replace(
-        options=replace(options, adjoint="reverse", steps=bool(np.any(np.diff(torque.times) == 0)))
+        options=replace(options, adjoint="reverse", has_jumps=bool(np.any(np.diff(torque.times) == 0)))
     )
 
     def one(number):

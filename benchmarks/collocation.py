@@ -9,7 +9,8 @@ is a share `u` of `T`, place a share `p` of the wire's length `L`, and `w = dp/d
     maximise m   subject to   dp/du = w,   dw/du = (T^2/L) (A0 + A3 tau1 + A4 tau2) + T A2 w + L A1 w^2,
                               F0 + F1 (L w/T)^2 + F2 (L w/T) + F3 tau1 + F4 tau2 >= m,   |tau| <= limit,   w >= 0
 
-with `A` and `F` the coefficients of `wholearm_jax.dynamics.path_dynamics.PathDynamics`. States are cubics on each interval that satisfy the
+with `A` and `F` the coefficients of `wholearm_jax.dynamics.path_dynamics.PathDynamics`. States are cubics on each
+interval that satisfy the
 equation of motion at Radau's three points; forces count at these points and at the start. Each smooth piece of the
 wire enters as one Chebyshev series for every coefficient, refitted from the table to 1e-10, so that IPOPT sees smooth
 functions and exact second derivatives.
@@ -82,10 +83,12 @@ class Course(NamedTuple):
 class Collocated:
     """What IPOPT made of a phase.
 
-    `course.plan_margin` [N] is the least force at the collocation points, `ipopt` its status. `margin` [N] and `assessment` are
+    `course.plan_margin` [N] is the least force at the collocation points, `ipopt` its status. `margin` [N] and
+    `assessment` are
     those of the honest simulation of `torque` (knots x 2, N m); `missed` is the distance to the wire's end that it
     leaves and `speed` the speed, in wire lengths and in these a duration. It took `solves` solves, `iterations` in all,
-    in `seconds` seconds (the best of them alone in `best_solve`) after `build` seconds of building. Of the `initial_guesses`
+    in `seconds` seconds (the best of them alone in `best_solve`) after `build` seconds of building. Of the
+    `initial_guesses`
     tried one after the other only `spent` counts all, in seconds.
     """
 
@@ -227,7 +230,8 @@ class Part(NamedTuple):
 class Programme(NamedTuple):
     """IPOPT's solver for one phase, bounds of its variables and constraints, and how its variables are laid out.
 
-    Variables are torques, splits, states and the least force, in this order (`_pack`, `_unpack`); `fused_matmul(splits)` are
+    Variables are torques, splits, states and the least force, in this order (`_pack`, `_unpack`);
+    `fused_matmul(splits)` are
     the shares `u` of the states.
     """
 
@@ -281,7 +285,8 @@ def _parts(phase: Phase, rows: tuple[int, ...], splits: ca.MX) -> list[Part]:
 
 
 class Block(NamedTuple):
-    """One piece's equations: collocation `defects`, `forces` [N], shares `fused_matmul`, what is positive to go `onward`."""
+    """One piece's equations: collocation `defects`, `forces` [N], shares `fused_matmul`, what is positive to go
+    `onward`."""
 
     defects: ca.MX
     forces: ca.MX

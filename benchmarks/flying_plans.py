@@ -2,7 +2,8 @@
 
     python benchmarks/flying_plans.py --count 4 --phases 3 --out DIR
 
-From a random grasp (`random_plans`) every admissible formation is followed to its end (`wholearm_jax.planning.successors`),
+From a random grasp (`random_plans`) every admissible formation is followed to its end
+(`wholearm_jax.planning.successors`),
 and from there every formation whose impact would push, not pull, and pass the speed on. Chains of real length whose
 formations torques can hold are kept.
 """

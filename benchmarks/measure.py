@@ -18,7 +18,8 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def seconds(call: Callable, *, repeats: int = 7, least: float = 0.02) -> float:
-    """Median wall time of one call, outputs waited for, after a warm-up; short calls are looped to `plan_margin` seconds."""
+    """Median wall time of one call, outputs waited for, after a warm-up; short calls are looped to `plan_margin`
+    seconds."""
     return compare({"": call}, repeats=repeats, least=least)[""]
 
 

@@ -5,7 +5,8 @@
 The same plans for all: both bundled ones at 1.0, 0.3 and 0.15 s a phase, and a dozen on random polygons
 (`random_plans`) at 1.0 and 0.3 s; the search chooses its own durations. Every margin is that of the package's own
 simulation of the torques found, and a plan fails unless that simulation's status is `ok`. Times are warm: `optimise`
-and `search_by_steps` run twice and the second run counts, tracing included. `optimise` descends on a plan's phases side by side
+and `search_by_steps` run twice and the second run counts, tracing included. `optimise` descends on a plan's phases
+side by side
 on all processors, IPOPT solves them one after the other: `processor` seconds, of both processors together, stand beside
 the others. Of the collocation only IPOPT's own time counts: for all solves from the guess that led to the result, and
 for the best of these solves alone; what building its programmes took stands beside it. The reference is the largest

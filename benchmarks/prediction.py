@@ -82,7 +82,8 @@ UNDECIDED = {Status.AMBIGUOUS, Status.SINGULAR, Status.NO_CONVERGENCE, Status.MA
 class Predicted(NamedTuple):
     """What the model says.
 
-    `best_quasistatic_torque_batch` (None: left out), and the same if a force may not be tensile at any moment (`strict`); the least force and
+    `best_quasistatic_torque_batch` (None: left out), and the same if a force may not be tensile at any moment
+    (`strict`); the least force and
     the mean force [N]; the longest time `dip` [s] for which a force is tensile while formations do not change, where
     the least force is (share of its phase), and how far from the planned end, over the tolerance, the object comes.
     """

@@ -156,7 +156,8 @@ def _flipped(plan: dict[str, Any], end: str) -> dict[str, Any] | None:
 
 
 def _held_to(plan: dict[str, Any], coordinate: int, least: float) -> str | None:
-    """Why the last phase ends, if it can be followed and held over at least `plan_margin` of a coordinate; else None."""
+    """Why the last phase ends, if it can be followed and held over at least `plan_margin` of a coordinate; else
+    None."""
     scene = wa.parse(plan)
     traced = wa.trace(scene)
     path, dynamics = traced[-1].path, traced[-1].dynamics

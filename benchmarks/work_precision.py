@@ -8,7 +8,8 @@ line in time, the smoothest that a schedule can hold. A run's error is the large
 reference is SciPy's DOP853 at 1e-13 on all five coordinates, which shares nothing with the package. Both end before the
 object comes to rest, and times within `MIN_SEPARATION` of a slip reversal, where forces jump, do not count.
 
-Every time is that of one phase, warm, taken in turn. The package is timed as `simulate_motion` alone, called from Python and, as a
+Every time is that of one phase, warm, taken in turn. The package is timed as `simulate_motion` alone, called from
+Python and, as a
 share of `MANY` phases that follow one another, within a program; as simulating and scoring (`run`); and with tracing
 and tabulating the wire included. Newton's method, too, is timed called from Python and within a program. All of JAX's
 programs, of both sides, are called as the package calls its own (`Program`) and compiled as `wholearm_jax.configure`

@@ -1,10 +1,9 @@
 """Differentiable dynamics and torque-trajectory optimisation for planar whole-arm manipulation.
 
-Read the modules in this order: `scene`, `contact_set`, `scaled_mechanics`, `solve_on_path`, `rest_margin`, `trace_curve`, `start`, `places` and `path`
-(trace), `reduction` (reduce), `schedule`, `stepping`, `landing` and `motion` (simulate), `forces` (score), `assessment`,
-`phase`, `result` and `plan`, `squeeze` (quasi-static torques and the bound), `shooting`, `linearisation`, `recursion`,
-`descent`, `pacing`, `initial_guesses` and `optimiser` (optimise), `baseline` (the paper's search), `variation` and `batch`
-(many scenes at once), `build_mujoco_model`, `coulomb`, `execution` and `perturbation` (virtual hardware).
+Read the folders in this order: `core`, `model` (what a scene is), `tracing` (the path of a contact formation),
+`dynamics` (the equations of motion along it), `simulation`, `margin` (contact forces and their minimum), `phases` (one
+after the other), `optimisation`, `planning`, `ensembles` (many scenes), `execution` (virtual hardware), `files`,
+`plotting`, `report` and `cli`. Each imports only from those above it.
 """
 
 from wholearm_jax.core import Status, configure

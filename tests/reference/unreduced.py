@@ -169,7 +169,8 @@ class Model:
     # --- time ---------------------------------------------------------------------------------------------------------
 
     def simulate(self, z, toward, times, values, end, rtol=1e-12, atol=1e-14):
-        """Move from rest at `z` from `fused_matmul[0]` to `end` under a piecewise linear torque; rest is not handled."""
+        """Move from rest at `z` from `fused_matmul[0]` to `end` under a piecewise linear torque; rest is not
+        handled."""
         signs = np.sign(self.reversing(z, self.direction(z, toward)))
         state, segments, reversals = np.concatenate([z, np.zeros(5)]), [], []
         for low, high, first, last in zip(times[:-1], times[1:], values[:-1], values[1:], strict=True):

@@ -1,7 +1,8 @@
 """Programs: functions compiled once for every size of their arguments, and kept between processes where wanted.
 
 JAX's own cache of compiled programs spares compiling, but not tracing Python into a program, which takes as long again.
-`keep_programs` names a folder where traced programs are kept too, exported by `jax.export`: a later process reads one in
+`keep_programs` names a folder where traced programs are kept too, exported by `jax.export`: a later process reads one
+in
 milliseconds, and finds what it compiles to in JAX's cache. A file's name is the digest of everything that decides what
 the program is: the package's source, the versions of what it is written with, the function, its static arguments, and
 the shapes of its arrays. What cannot be named so (a function that closes over objects) is traced anew in each process.

@@ -41,13 +41,17 @@ TERMS = 5  # 1, v^2, v, tau1, tau2
 class PathDynamics(eqx.Module):
     """A reduced wire: polynomials in the panel coordinate `xi` in [-1, 1], lowest power first, SI units.
 
-    `path_acceleration[p, k]` are the coefficients of `a = ds^2/dt^2` in `(1, v^2, v, tau1, tau2)`, `contact_force[p, k, i]` those of
-    the force in constraint `i` [N]: `c_n`, or `c_t` where `tangential` (a contact that rolls), with `rolling_friction` its friction
+    `path_acceleration[p, k]` are the coefficients of `a = ds^2/dt^2` in `(1, v^2, v, tau1, tau2)`, `contact_force[p,
+    k, i]` those of
+    the force in constraint `i` [N]: `c_n`, or `c_t` where `tangential` (a contact that rolls), with `rolling_friction`
+    its friction
     coefficient (0 elsewhere). `configuration[p, k]` are those of `z`, `velocity[p, k]` those of `dz/ds`.
-    `reverse_acceleration[p, k]` are those of `a` in `(1, tau1, tau2)` for travel the other way at rest, times the square of the 5x5
+    `reverse_acceleration[p, k]` are those of `a` in `(1, tau1, tau2)` for travel the other way at rest, times the
+    square of the 5x5
     determinant (against that without friction): the same sign, and smooth where friction would wedge the object on its
     way back. `friction_ratio[piece, i]` is `c_t / c_n` (eq. 3) where a contact slides.
-    `impact_map` serves an object that arrives with `z_dot` from another formation: its rows times `z_dot` are `ds/dt` after
+    `impact_map` serves an object that arrives with `z_dot` from another formation: its rows times `z_dot` are `ds/dt`
+    after
     the inelastic impact and the contacts' impulses [N s] (see `resolve_impact`).
     `error` is the largest interpolation error, relative to each function's own size; `condition` the largest
     condition number of the 5x5 matrix.
@@ -266,7 +270,8 @@ _evaluate_dot.defjvp(_evaluate_dot_jvp, symbolic_zeros=True)
 
 
 def _fit_panels(columns: dict[str, Float[Array, "panels nodes *shape"]]) -> tuple[dict[str, Array], Float[Array, ""]]:
-    """Polynomials through the values of functions at the nodes, and the largest of their errors (`_interpolation_error`)."""
+    """Polynomials through the values of functions at the nodes, and the largest of their errors
+    (`_interpolation_error`)."""
     every = jnp.concatenate([c.reshape(*c.shape[:2], -1) for c in columns.values()], axis=2)
     to_powers, to_last = _chebyshev_transforms(every.shape[1])
     ends = np.cumsum([math.prod(c.shape[2:]) for c in columns.values()])[:-1]

@@ -32,7 +32,8 @@ def advance(
     """One time step under `torque`: the forces `(c_n, c_t)` [N] of all pairs on the object, and how wrong they are.
 
     `before` are those of the step before, from which friction is looked for. The second is the largest speed [m/s] by
-    which a contact slips in this step against Coulomb's law: by `SOLVER_TOL` of what friction can do in a step, more where
+    which a contact slips in this step against Coulomb's law: by `SOLVER_TOL` of what friction can do in a step, more
+    where
     `ROUNDS` were not enough (at rest, where the friction of several contacts is not determined), and much where no
     forces agree with that law, as there need not be any if friction is large.
     """

@@ -1,4 +1,5 @@
-r"""Execute: a torque schedule driven open loop through `build_mujoco_model`, and what became of it against the prediction.
+r"""Execute: a torque schedule driven open loop through `build_mujoco_model`, and what became of it against the
+prediction.
 
 The object is placed at the projected start of the plan's first wire, at rest, every gap 0; nothing settles before the
 torque begins. Each step holds the torque of its middle. The plan succeeded if at its end the object stands where the

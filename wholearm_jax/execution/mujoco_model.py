@@ -3,7 +3,8 @@ r"""Virtual hardware: the hand and the polygon as free bodies in MuJoCo, held to
 The coordinates are those of the prediction, `z = (x, y, phi, theta1, theta2)`: two slides and a hinge for the object,
 a hinge for each finger. Fingers have inertia J about their joint (and their centre of mass on it, so that gravity acts
 on the object alone, as in eqs. 1-3), viscous friction B and dry friction D. No contact formation is assumed: all pairs
-of features that may touch (`contact_set.contact_candidates`) are pairs of shapes that MuJoCo tests at every step. The shapes
+of features that may touch (`contact_set.contact_candidates`) are pairs of shapes that MuJoCo tests at every step. The
+shapes
 make MuJoCo's distances equal the C-functions:
 
 - an object vertex and a fingertip are dots, spheres of radius `r`, a hundred-thousandth of the object's;

@@ -3,7 +3,8 @@ r"""Perturb: a plan executed many times with friction, mass, geometry and start 
 Every draw is uniform within plus or minus its amount, as in an ensemble (`ensembles.make_ensemble`): a factor on each
 link's friction coefficient, one on the mass (and with it the inertia), an offset of each coordinate of each vertex, and
 a displacement of the object's start in x, y and, over its radius, phi. The object that is then laid in the hand touches
-as the first formation says: the start is the nearest configuration at which the perturbed object's gaps are 0 (least-norm Newton steps in object units). The
+as the first formation says: the start is the nearest configuration at which the perturbed object's gaps are 0
+(least-norm Newton steps in object units). The
 torques stay those of the unperturbed plan, and so does the end that counts as success.
 """
 
@@ -180,7 +181,8 @@ def _touch_down(shape, hand, gravity, formation: ContactFormation, z, shift) -> 
 def rollout_in_parallel(
     copies: Iterable[tuple[MujocoModel, Float[np.ndarray, "5"]]], torques, workers: int
 ) -> Iterator[tuple[Float[np.ndarray, "5"], float]]:
-    """Where free bodies end, driven from rest at their starts, and how far contacts crept (`execution.trace_phase_path`)."""
+    """Where free bodies end, driven from rest at their starts, and how far contacts crept
+    (`execution.trace_phase_path`)."""
     each = (delayed(_end)(bodies, start, torques) for bodies, start in copies)
     return Parallel(n_jobs=workers, return_as="generator")(each)  # pyright: ignore[reportReturnType]
 

@@ -138,7 +138,8 @@ def cone_facets(
     """Linear functions of the forces whose least is the least `force_slack`: both sides of each friction cone.
 
     `forces` may be coefficients, by any linear terms. Four constraints have at most two tangential rows, and so there
-    are six of these, fewer where it is known that no more than `rolling` roll; those not needed (`is_duplicate_facet`) repeat the
+    are six of these, fewer where it is known that no more than `rolling` roll; those not needed (`is_duplicate_facet`)
+    repeat the
     first.
     """
     column = (slice(None), *(None,) * (forces.ndim - 1))
@@ -171,7 +172,8 @@ def sampled_slacks(
     samples: int = SAMPLES_PER_STEP,
     kind=force_slack,
 ) -> Float[Array, "steps samples rows"]:
-    """`force_slack` (or `cone_facets`) at evenly spaced places of every step, ends included; infinite where all rests."""
+    """`force_slack` (or `cone_facets`) at evenly spaced places of every step, ends included; infinite where all
+    rests."""
     xi = jnp.linspace(0.0, 1.0, samples, dtype=steps.quintic.dtype)
     on = partial(slacks_at, kind=kind)
     at = jax.vmap(jax.vmap(on, (None, None, None, None, 0)), (None, None, None, 0, None))

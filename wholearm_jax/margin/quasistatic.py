@@ -33,7 +33,8 @@ class QuasistaticTorque(eqx.Module):
 
 
 class MarginBound(eqx.Module):
-    """No torque within limits keeps every slack above `value` [N] for a whole phase: `s` and `path_fraction` of the wire say
+    """No torque within limits keeps every slack above `value` [N] for a whole phase: `s` and `path_fraction` of the
+    wire say
     where it is tight."""
 
     value: Float[Array, ""]
@@ -96,7 +97,8 @@ def margin_upper_bound(
 ) -> MarginBound:
     """An upper bound on the margin of a phase along a wire that starts, and ends, at rest or moving.
 
-    At each of many places the least slack is maximised over torques within limits and over speeds up to `MAX_SPEED_RATIO` wire
+    At each of many places the least slack is maximised over torques within limits and over speeds up to
+    `MAX_SPEED_RATIO` wire
     lengths a duration (each interval of speeds by its most favourable corner, so that the bound errs upward); at rest
     speed is 0 and the acceleration may point only forward (start) or backward (end). The smallest of these bounds the
     phase. What no more than `rolling` contacts can need is left out: without any, it takes less than half the time.

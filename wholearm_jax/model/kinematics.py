@@ -47,8 +47,10 @@ kernels that do nothing else."""
 class ContactSet(eqx.Module):
     """Contacts as arrays; the leading axis runs over the constraints of a formation (`ContactFormation`).
 
-    `along` (see `ContactKinematics`) must stay within `[lower, upper]`: the link's extent for type A, the edge's for type B.
-    `tangential` marks rows that constrain the slip, at the place `rolling_anchor`, and `slides` those of contacts that may slip.
+    `along` (see `ContactKinematics`) must stay within `[lower, upper]`: the link's extent for type A, the edge's for
+    type B.
+    `tangential` marks rows that constrain the slip, at the place `rolling_anchor`, and `slides` those of contacts that
+    may slip.
     """
 
     on_link: Bool[Array, "rows"]
@@ -126,7 +128,8 @@ def contact_candidates(capacity: int) -> ContactFormation:
 
 
 def obstacle_candidates(capacity: int) -> ContactFormation:
-    """The same, then each finger's root and each end of the palm on each edge, which stop the object: all `FEATURE_GROUPS`."""
+    """The same, then each finger's root and each end of the palm on each edge, which stop the object: all
+    `FEATURE_GROUPS`."""
     return _on_features(FEATURE_GROUPS, capacity)
 
 

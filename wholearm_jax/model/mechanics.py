@@ -19,8 +19,10 @@ class ScaledMechanics(eqx.Module):
     """A formation on a hand, dimensionless but for time.
 
     `inertia` is the diagonal of `M = diag(m, m, I, J1, J2)`; `viscous` and `dry` are B and D; `gravity` is an
-    acceleration. `candidates` are all pairs that may touch, `exists` those of features that the object has; `may_terminate`
-    marks those that could end the formation, `may_be_behind` vertices that may lie behind a link, whose back stops them.
+    acceleration. `candidates` are all pairs that may touch, `exists` those of features that the object has;
+    `may_terminate`
+    marks those that could end the formation, `may_be_behind` vertices that may lie behind a link, whose back stops
+    them.
     `length` [m] and `mass` [kg] are the units; `torque_limit` stays in N m.
     """
 

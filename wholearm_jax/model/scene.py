@@ -100,7 +100,8 @@ class ContactFormation(eqx.Module):
 class PathTarget(eqx.Module):
     """Which way along the wire, and where to stop before its end.
 
-    Travel starts with the sign `sign` in coordinate number `path_coordinate` (-1: in the one that changes most); the phase
+    Travel starts with the sign `sign` in coordinate number `path_coordinate` (-1: in the one that changes most); the
+    phase
     ends where coordinate number `until_coordinate` reaches `until_value`, or where the formation ends if that is -1.
     """
 
@@ -177,7 +178,8 @@ def contact_formation(contacts) -> ContactFormation:
 
 
 def path_target(toward: str | None, until: Mapping[Any, float] | None = None) -> PathTarget:
-    """Build a `PathTarget` from a coordinate and a sign (`"x-"`; None: either way) and an optional `{coordinate: value}`
+    """Build a `PathTarget` from a coordinate and a sign (`"x-"`; None: either way) and an optional `{coordinate:
+    value}`
     to stop at."""
     coordinate, value = next(iter(until.items())) if until else (None, 0.0)
     return PathTarget(

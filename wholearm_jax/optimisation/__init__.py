@@ -1,4 +1,5 @@
-"""Torque schedules with the largest margin: multiple shooting, interior point, Riccati recursion, the paper's search."""
+"""Torque schedules with the largest margin: multiple shooting, interior point, Riccati recursion, the paper's
+search."""
 
 from wholearm_jax.optimisation.optimiser import (
     MIN_TRANSITION_SPEED,

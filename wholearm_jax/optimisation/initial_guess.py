@@ -30,8 +30,10 @@ FALLBACK_PROFILES = (
 def initial_guesses(phase_dynamics: list[PathDynamics], durations, knots: int, share: float) -> list[Variables]:
     """Motions with the torques that give them, within a `share` of the limits, by the best squeeze.
 
-    One phase goes from rest to rest: first that of `SPEED_PROFILES` with the largest margin (the even one unless another
-    gains more than 2 %), then `FALLBACK_PROFILES`. Several go through their changes of formation at each of `BOUND_SPEEDS`.
+    One phase goes from rest to rest: first that of `SPEED_PROFILES` with the largest margin (the even one unless
+    another
+    gains more than 2 %), then `FALLBACK_PROFILES`. Several go through their changes of formation at each of
+    `BOUND_SPEEDS`.
     """
     if len(phase_dynamics) == 1:
         motions = _profiles(knots)

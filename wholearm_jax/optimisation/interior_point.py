@@ -63,7 +63,8 @@ DEFECT_TOL = 1e-9  # sum of the defects below which the intervals count as joine
 
 class InteriorPointState(NamedTuple):
     """The interior point's own unknowns: slack and price of every room, with the intervals that their parts were of
-    (`interval_of_part`), the level `m` of the margin (NaN: not yet chosen), the temperature and the `coldest` that it may become,
+    (`interval_of_part`), the level `m` of the margin (NaN: not yet chosen), the temperature and the `coldest` that it
+    may become,
     the shares of its last step that were taken, and the largest price of joining the intervals."""
 
     slack: Float[Array, "phases parts rooms"]
@@ -145,7 +146,8 @@ def _step_cap(linear: LinearisedProblem, way):
 
 
 class Cooling(NamedTuple):
-    """State of `projected`: the inner optimiser's, the level `m` of the smooth margin, and as in `InteriorPointState`. Its steps
+    """State of `projected`: the inner optimiser's, the level `m` of the smooth margin, and as in `InteriorPointState`.
+    Its steps
     keep the intervals joined, as far as they are linear: that has no price."""
 
     inner: optax.OptState
@@ -187,7 +189,8 @@ def projected(optimiser: optax.GradientTransformation, cooling: float = 0.98) ->
 
 
 def retract(p: Variables, way: Variables, share, phase_dynamics: PathDynamics, limits: Limits) -> Variables:
-    """`p` after a `step_fraction` of a direction, on the curve along which accelerations and squeezes at knots change evenly.
+    """`p` after a `step_fraction` of a direction, on the curve along which accelerations and squeezes at knots change
+    evenly.
 
     Torques balance to a small remainder, the acceleration: where the state at a knot moves, they have to move with it.
     The curve's tangent is the direction. A knot that passes from one piece of the wire to another goes straight.

@@ -55,7 +55,8 @@ class Slacks(NamedTuple):
 
 class LinearisedProblem(NamedTuple):
     """All intervals at `p` with derivatives: `at` and `rates` (last axis: an interval's seven numbers); the rooms'
-    `weight` (0: does not exist), the interval that each part is of (`IntervalResults.interval_of_part`); what must vanish, `defect`, and its
+    `weight` (0: does not exist), the interval that each part is of (`IntervalResults.interval_of_part`); what must
+    vanish, `defect`, and its
     derivatives `across`; `bears` marks the rooms that the margin lowers, `still` the variables that stay."""
 
     at: Slacks

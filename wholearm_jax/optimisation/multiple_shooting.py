@@ -80,7 +80,8 @@ class Samples(NamedTuple):
 
 
 class IntervalResults(NamedTuple):
-    """Intervals simulated: all their parts, in which interval each lies (`interval_of_part`), and the states at the intervals'
+    """Intervals simulated: all their parts, in which interval each lies (`interval_of_part`), and the states at the
+    intervals'
     ends as in `Variables`. Part `k` is the first one of interval `k`; behind the intervals' number is one for each
     piece of the wire that an interval comes into, and then those that come into a piece once more."""
 
@@ -109,7 +110,8 @@ def simulate_intervals(
 ) -> IntervalResults:
     """Simulate intervals of a phase, which as a whole has `intervals`.
 
-    Where together they are cut more often than there is room for (`extra_parts`), or a cut is not found, they end in NaN.
+    Where together they are cut more often than there is room for (`extra_parts`), or a cut is not found, they end in
+    NaN.
     """
     cut, room = q.shape[0], q.shape[0] + extra_parts(dynamics)
     segments = dynamics.speed_ratio.shape[-1]

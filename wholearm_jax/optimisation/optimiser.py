@@ -95,7 +95,8 @@ class OptimisationResult:
 def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[TracedPhase, ...] = ()) -> TorqueSchedule:
     """The quasi-static torques: at each knot the best squeeze for an even rest-to-rest motion, in closed form.
 
-    The motion's speed is `v ~ u^p (1 - u)^q` in `u = t / duration`: the even `p = q = 1` unless another of `SPEED_PROFILES`
+    The motion's speed is `v ~ u^p (1 - u)^q` in `u = t / duration`: the even `p = q = 1` unless another of
+    `SPEED_PROFILES`
     allows a larger margin. As the inverse dynamics at the knots only, the schedule carries the object near the wire's
     end, not exactly to it. A phase that holds the object gets its best torque.
 
@@ -117,10 +118,12 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[TracedPhase, ...
 
 
 def bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[MarginBound, ...]:
-    """For each phase the certificate that no torque within limits holds it with a larger margin (`squeeze.margin_upper_bound`), or
+    """For each phase the certificate that no torque within limits holds it with a larger margin
+    (`squeeze.margin_upper_bound`), or
     that of the statics for a phase that holds the object; `-inf` for a wire that could not be traced.
 
-    Derivation, section 8: a tuple of `MarginBound`, one a phase, with `value` [N], and `s` and `share` of the wire where
+    Derivation, section 8: a tuple of `MarginBound`, one a phase, with `value` [N], and `s` and `share` of the wire
+    where
     it is tight.
 
     >>> [f"{float(bound.value):.3f} N" for bound in wa.bounds(wa.load("heptagon"))]

@@ -71,7 +71,8 @@ class ReachableTorque(NamedTuple):
 
 
 class RestTransition(NamedTuple):
-    """The `torque` [N m] at a change and the one with which the object sets out (`begin`), `lead` [s] later; `margin_fraction`
+    """The `torque` [N m] at a change and the one with which the object sets out (`begin`), `lead` [s] later;
+    `margin_fraction`
     is the least margin at both over its bound, `-inf` where no torques can serve."""
 
     torque: Float[np.ndarray, "2"]

@@ -50,7 +50,8 @@ class _StageLayout(NamedTuple):
     """The numbers of a stage: state and torques at its knot, the shared numbers (`level`, `durations`, `goals` and
     `one`), torques at the next knot from `size` on.
 
-    `interval_inputs` says which of an interval's seven numbers each is (7: none), `own` which variable of `p` counts in this
+    `interval_inputs` says which of an interval's seven numbers each is (7: none), `own` which variable of `p` counts
+    in this
     stage and no other (the last: none). `ends` marks the goals of places and speeds in the stages that meet them, `v`
     are the last speeds of phases that hand over, `lost` and `steps` their equations.
     """

@@ -87,7 +87,8 @@ class Written(NamedTuple):
 def report(folder: str | Path) -> str:
     """The report of a result folder as one HTML page.
 
-    Reads `summary.json`, `trajectory.csv` and `torque_schedule.csv`. Raises `SceneError` naming the file and what is wrong.
+    Reads `summary.json`, `trajectory.csv` and `torque_schedule.csv`. Raises `SceneError` naming the file and what is
+    wrong.
     """
     return render(read_result(folder))
 

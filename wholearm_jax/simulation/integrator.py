@@ -219,7 +219,8 @@ def _step_ends(phase_schedule: PhaseSchedule, steps: AcceptedSteps, final):
 def integrate_with_replay_adjoint(
     inputs, field_of: Callable, stop_of: Callable, options: IntegratorOptions, final, limits, way
 ) -> AcceptedSteps:
-    """`integrate_adaptive`, of `field_of(parameters, seen)` until `stop_of(limits)`, whose reverse mode goes back over its own
+    """`integrate_adaptive`, of `field_of(parameters, seen)` until `stop_of(limits)`, whose reverse mode goes back over
+    its own
     steps.
 
     `inputs` are `(parameters, seen, begin, y)`, what it can be differentiated by. Each step is computed once more on

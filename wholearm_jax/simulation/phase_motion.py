@@ -40,7 +40,8 @@ from wholearm_jax.simulation.integrator import (
 class Motion(NamedTuple):
     """The accepted steps of a phase, `count` of them: from node `i` to node `i + 1` in time, `s` and `w`.
 
-    Step `i` lies in piece `segment[i]` and torque interval `row[i]`; `at_rest[i]` marks waiting at rest. `phase_time` is time in
+    Step `i` lies in piece `segment[i]` and torque interval `row[i]`; `at_rest[i]` marks waiting at rest. `phase_time`
+    is time in
     durations. Rows beyond `count` repeat the end. `status` is that of the end alone: `ok` (end of time while moving),
     `left_formation` (the wire's end), `stuck`, `reversed`, `ambiguous`, `no_convergence` (a landing) or `max_steps`.
     """
@@ -83,7 +84,8 @@ def simulate_motion(
 ) -> Motion:
     """Move along a wire for one phase, from its start (or `s`) at `speed` [1/s].
 
-    `ignore_stops` lets the motion pass rest and the wire's end with forward signs: a smooth continuation that optimisation may
+    `ignore_stops` lets the motion pass rest and the wire's end with forward signs: a smooth continuation that
+    optimisation may
     differentiate, not physics; only an honest run (`free=False`) decides what happens.
     """
     capacity = options.max_steps

@@ -2,7 +2,8 @@ r"""March: follow the curve `z(s)` of a formation in short steps until something
 
 Each step predicts the next node by the cubic through the last two and their tangents, and corrects it by Newton's
 method on the C-functions in the plane `u . z = s`, `u` being the chart's direction. What is seen on the way: what ends
-the wire (`rest_margin`), slips and joint speeds (each reversal is a kink), and the sign of `det [G; x]`, which changes where
+the wire (`rest_margin`), slips and joint speeds (each reversal is a kink), and the sign of `det [G; x]`, which changes
+where
 two wires meet.
 
 Derivation: section 3 of `docs/derivation.md`.
@@ -86,7 +87,8 @@ class _ContinuationState(NamedTuple):
     `last` is the last node within the wire, `earlier` the one before it, `chart` the last one; kept beside the rows,
     which are only ever written: what is read as well would be copied in each step. `near` says that the last try came
     past the end of the wire: the next one stops just short of it, and the one after that goes over it. `speeds` are
-    those of the last node, `sense` the signs that they had last. `before` is what is watched at the last node, `limit_violations`
+    those of the last node, `sense` the signs that they had last. `before` is what is watched at the last node,
+    `limit_violations`
     at the last one tried.
     """
 

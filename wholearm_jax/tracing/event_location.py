@@ -74,7 +74,8 @@ def locate_events(mechanics, target, curve: TracedCurve, most: int) -> EventPoin
 
 
 def _event_residuals(mechanics, target, curve, z, x, ahead_of_guess):
-    """What may fix a place on the wire by vanishing there: `reversal_functions`, the way from the guess, what ends the wire."""
+    """What may fix a place on the wire by vanishing there: `reversal_functions`, the way from the guess, what ends the
+    wire."""
     pairs, slots = mechanics.candidates.lower.shape[0], mechanics.contacts.lower.shape[0]
     made = jnp.clip(curve.end, 0, pairs - 1)
     contacts = jax.tree.map(

@@ -36,7 +36,8 @@ class EventValues(NamedTuple):
 
 
 class EventFunctions(NamedTuple):
-    """What is watched: all pairs that may touch (`ScaledMechanics.candidates`), room before and behind each contact on its
+    """What is watched: all pairs that may touch (`ScaledMechanics.candidates`), room before and behind each contact on
+    its
     feature, and a coordinate's limit.
 
     `gap`, `along`, `limit` and `shift` are the weights of a row's value. A pair ends the wire within `[lower, upper]`

@@ -2,9 +2,11 @@ r"""Trace: the curve `z(s)` on which a formation of four constraints moves, its 
 
 Four C-functions (gaps, and the places where rolling contacts touch) in five unknowns leave a wire that depends on
 geometry alone. It is charted by the linear coordinate
-`s = s_ref + u . (z - z_ref)` (object units, see `scaled_mechanics`), `u` being the unit tangent where the chart begins; a wire
+`s = s_ref + u . (z - z_ref)` (object units, see `scaled_mechanics`), `u` being the unit tangent where the chart
+begins; a wire
 that turns away from `u` continues in a new chart, so turning points of single coordinates are nothing special. The
-search for its end and its kinks (`trace_curve`) runs on constants; at every place that it finds something vanishes on the
+search for its end and its kinks (`trace_curve`) runs on constants; at every place that it finds something vanishes on
+the
 wire, from which derivatives follow (`solve_on_path`).
 
 A wire is cut into *pieces* where a contact's slip or a joint's speed reverses, or the chart changes: within a piece
@@ -96,7 +98,8 @@ def trace_path(
 ) -> ContactPath:
     """Project `initial_guess` (SI) onto the formation and follow its wire as `path_target` says, to its end.
 
-    Never raises for a configuration that does not work: `ContactPath.status` says `no_convergence` (the contacts cannot all
+    Never raises for a configuration that does not work: `ContactPath.status` says `no_convergence` (the contacts
+    cannot all
     touch near the start), `left_formation` (there a contact is beyond its feature, or the object inside a link),
     `singular` (fold or branch), `max_steps` (no end within reach) or `ok`.
     """

@@ -67,7 +67,8 @@ def solve_on_path(
     steps: int = 20,
     longest: float = 0.3,
 ) -> PathRoot:
-    """The place near `z` on the wire of `scaled_mechanics` where `function(system, z, x, *parameters)` is 0, to rounding level.
+    """The place near `z` on the wire of `scaled_mechanics` where `function(system, z, x, *parameters)` is 0, to
+    rounding level.
 
     `u.x = 1`; each step is no longer than `longest`. A root that was not found shows in `residual`, never as NaN or an
     exception.
