@@ -1,4 +1,4 @@
-"""Differentiate the margin with respect to every number of the scene and to the torques, and step along the gradient."""
+"""Differentiate the margin with respect to every number of a scene and to the torques; step along the gradient."""
 
 import equinox as eqx
 
