@@ -1,6 +1,8 @@
-"""Documents: every example in a public docstring runs, every cited section and linked file exists, statuses agree."""
+"""Documents: public examples run; cited sections, linked files and named code exist; statuses agree; a short README."""
 
+import ast
 import doctest
+import importlib
 import inspect
 import re
 from pathlib import Path
@@ -8,14 +10,49 @@ from pathlib import Path
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.core.status import Status
-from wholearm_jax.files import scene_toml as scene_file
+from wholearm_jax.core import Status
+from wholearm_jax.files import scene_toml
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "wholearm_jax"
-PAGES = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), ROOT / "notebooks" / "README.md"]
+DOCS = ROOT / "docs"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+FOLDERS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted(DOCS.rglob("*.md")),
+    *(ROOT / name / "README.md" for name in ("notebooks", "benchmarks")),
+]
 # What is made by, or given to, those that have one; and what takes long to compile and is tested by itself.
 WITHOUT_EXAMPLE = {"IntegratorOptions", "TorqueSchedule", "check"}
+
+
+def defined_names() -> set[str]:
+    """Top-level names of every module of the package, parameters of functions, and `Class.member` of every class."""
+    names = set()
+    for path in MODULES:
+        for node in ast.parse(path.read_text()).body:
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+            names |= {n.id for target in targets if target for n in ast.walk(target) if isinstance(n, ast.Name)}
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                names.add(node.name)
+            for inner in ast.walk(node):
+                if isinstance(inner, ast.arg):
+                    names.add(inner.arg)
+            for member in node.body if isinstance(node, ast.ClassDef) else ():
+                if isinstance(member, ast.AnnAssign) and isinstance(member.target, ast.Name):
+                    names |= {member.target.id, f"{node.name}.{member.target.id}"}
+                if isinstance(member, ast.FunctionDef):
+                    names.add(f"{node.name}.{member.name}")
+    return names
+
+
+def test_the_files_that_these_tests_read_are_all_there():
+    assert len(FOLDERS) >= 15
+    assert len(MODULES) > 80
+    assert len(list(DOCS.glob("*.md"))) >= 13
+    assert len(list((DOCS / "api").glob("*.md"))) == len(FOLDERS) + 1
+    assert all(path.exists() for path in PAGES)
 
 
 @pytest.mark.parametrize("name", wa.__all__)
@@ -30,40 +67,93 @@ def test_examples_in_docstrings_run(name, tmp_path):
     assert result.failed == 0, "".join(printed)
 
 
+def test_readme_is_short():
+    assert len((ROOT / "README.md").read_text().split()) <= 900
+
+
 def test_every_status_has_a_row_that_agrees():
-    rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", (ROOT / "docs" / "statuses.md").read_text(), re.MULTILINE))
+    table, exit_statuses = (DOCS / "statuses.md").read_text().split("## Exit status")
+    rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", table, re.MULTILINE))
     assert rows == {status.label: status.advice for status in Status}
+    assert "`optimise`" in exit_statuses
 
 
 def test_the_page_on_scene_files_has_every_key():
-    rows = re.findall(r"^\| ((?:`[\w.]+`(?:, )?)+) \|", (ROOT / "docs" / "scenes.md").read_text(), re.MULTILINE)
-    told = [key for row in rows for key in re.findall(r"`([\w.]+)`", row)]
-    models = scene_file._Scene, scene_file._Finger, scene_file._Object, scene_file._Phase
+    rows = re.findall(r"^\| ((?:`[\w.]+`(?:, )?)+) \|", (DOCS / "scenes.md").read_text(), re.MULTILINE)
+    keys = [key for row in rows for key in re.findall(r"`([\w.]+)`", row)]
+    models = scene_toml._Scene, scene_toml._Finger, scene_toml._Object, scene_toml._Phase
     known = [name for model in models for name in model.model_fields if name != "hand"]
-    assert sorted(told) == sorted([*known, *(f"hand.{name}" for name in scene_file._Hand.model_fields)])
+    assert sorted(keys) == sorted([*known, *(f"hand.{name}" for name in scene_toml._Hand.model_fields)])
 
 
 def test_sections_that_the_code_cites_exist():
-    sections = set(re.findall(r"^## (\d+)\.", (ROOT / "docs" / "derivation.md").read_text(), re.MULTILINE))
-    texts = {path: path.read_text() for path in [*PACKAGE.rglob("*.py"), *PAGES]}
+    sections = set(re.findall(r"^## (\d+)\.", (DOCS / "derivation.md").read_text(), re.MULTILINE))
+    assert len(sections) >= 11
+    texts = {path: path.read_text() for path in [*MODULES, *PAGES]}
     citing = 0
     for path, text in texts.items():
-        for cited in re.findall(r"[Dd]erivation[,:] sections? (\d+)(?: and (\d+))?", text):
+        for cited in re.findall(r"[Dd]erivation(?:\]\([^)]*\))?[,:] sections? (\d+)(?: and (\d+))?", text):
             assert set(cited) - {""} <= sections, path
             citing += 1
-    assert citing > 12
+    assert citing > 20
 
 
 def test_modules_that_the_derivation_names_exist():
-    named = re.findall(r"[Mm]odules? ((?:`\w+`(?:, )?)+)", (ROOT / "docs" / "derivation.md").read_text())
-    modules = {name for group in named for name in re.findall(r"`(\w+)`", group)}
-    assert len(modules) >= 10
-    assert modules <= {path.stem for path in PACKAGE.rglob("*.py")}
+    named = re.findall(r"[Mm]odules? ((?:`[\w/]+`(?:, )?)+)", (DOCS / "derivation.md").read_text())
+    modules = {name for group in named for name in re.findall(r"`([\w/]+)`", group)}
+    assert len(modules) >= 20
+    paths = {path.relative_to(PACKAGE).with_suffix("").as_posix() for path in MODULES}
+    assert modules <= paths
+
+
+def test_names_of_the_glossary_exist():
+    rows = re.findall(r"^\|[^|]*\|[^|]*\|([^|]*)\|$", (DOCS / "glossary.md").read_text(), re.MULTILINE)
+    named = {name for row in rows for name in re.findall(r"`([\w.]+)`", row)}
+    assert len(named) >= 100
+    assert named <= defined_names() | set(wa.__all__)
+
+
+def test_new_names_of_the_changes_exist():
+    rows = re.findall(r"^\|[^|]*\|([^|]*)\|$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    named = {name for row in rows for name in re.findall(r"`([\w.]+)", row)}
+    assert len(named) >= 60
+    folders = {f"wholearm_jax.{name}" for name in FOLDERS}
+    loose = {name.removeprefix("wa.") for name in named if name.partition(".")[0] != "wholearm_jax"}
+    assert loose <= defined_names() | set(wa.__all__)
+    for name in named - loose - folders:
+        folder, _, attribute = name.removeprefix("wa.").rpartition(".")
+        if folder.startswith("wholearm_jax"):
+            assert hasattr(importlib.import_module(folder), attribute), name
+
+
+def test_symbols_of_the_glossary_are_given_once():
+    rows = re.findall(r"^\| ([^|]+) \|[^|]*\| `", (DOCS / "glossary.md").read_text(), re.MULTILINE)
+    symbols = [row.strip() for row in rows if row.strip()]
+    assert len(symbols) >= 30
+    assert len(symbols) == len(set(symbols))
+
+
+def test_pages_on_the_layout_name_every_folder():
+    page = (DOCS / "architecture.md").read_text()
+    assert [name for name in FOLDERS if f"      {name}/ " not in page or f"| `{name}` |" not in page] == []
+    assert sorted(path.stem for path in (DOCS / "api").glob("*.md")) == sorted(["README", *FOLDERS])
+
+
+def test_files_that_documents_and_docstrings_cite_exist():
+    """`tests/...`, `benchmarks/...`, `docs/...` and `examples/...` in backticks, in pages and in the code."""
+    cited = {
+        (path, name)
+        for path in [*MODULES, *PAGES]
+        if path.name != "CHANGELOG.md"
+        for name in re.findall(r"`((?:tests|benchmarks|docs|examples|notebooks)/[\w./-]+)`", path.read_text())
+    }
+    assert len(cited) >= 8
+    assert [(str(path), name) for path, name in cited if not (ROOT / name).exists()] == []
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_links_lead_somewhere(path):
     links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", path.read_text())
-    assert links or path.parent.name == "docs"
+    assert links or DOCS in path.parents
     for link in links:
         assert link.startswith("http") or (path.parent / link).exists(), link

@@ -16,5 +16,5 @@ def test_the_python_lines_run(tmp_path, monkeypatch):
     names = {}
     exec(code.group(1), names)
     assert (tmp_path / "result.png").stat().st_size > 10_000
-    assert names["found"].result.status.label == "ok"
+    assert names["optimum"].result.status.label == "ok"
     assert np.all(np.isfinite(names["slope"].object.vertices))
