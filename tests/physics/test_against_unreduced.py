@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference import unreduced
 from scipy.optimize import brentq
 from support import DURATION, passing
 
 import wholearm_jax
+from tests.reference import unreduced
 from wholearm_jax.files import scene_toml as scene_file
 from wholearm_jax.margin import quasistatic as squeeze
 from wholearm_jax.phases.phase_ends import configuration, start_configuration

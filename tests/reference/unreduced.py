@@ -1,21 +1,24 @@
-"""An independent simulation without the wire: Newton-Euler with four gap constraints, in NumPy and SciPy only.
+"""An independent simulation without the contact path: Newton-Euler with constraints at acceleration level, in NumPy
+and SciPy.
 
-Nothing here is shared with the package. All five coordinates `z = (x, y, phi, theta1, theta2)` and their rates are
-integrated; at each time one 9x9 system gives accelerations and contact forces,
+Nothing here is shared with the package; the contacts' geometry is `reference.mechanics`. All five coordinates
+`z = (x, y, phi, theta1, theta2)` and their rates are integrated; at each time one system gives accelerations and
+forces,
 
     [ M    -(G_n - Xi U G_t)^T ] [ z_ddot ]   [ E tau + g - B z_dot - D sgn(z_dot) ]
     [ G_n   0                  ] [ c_n    ] = [ -G_n_dot z_dot                     ]
 
-A rolling contact adds a row of its own, `G_t z_ddot = -G_t_dot z_dot`, and a free tangential force `c_t`; `G_t_dot` is
-taken by complex-step differentiation, so that no second derivative is written down.
-
-Signs of slips (Xi) and of joint speeds are constants of a segment; segments end on torque knots and on reversals.
+A rolling contact adds a row of its own, `G_t z_ddot = -G_t_dot z_dot`, and a free tangential force `c_t`. Signs of
+slips
+(Xi) and of joint speeds are constants of a segment; segments end on torque knots and on reversals.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.integrate import solve_ivp
+
+from tests.reference import mechanics
 
 COORDINATES = ("x", "y", "phi", "theta1", "theta2")
 LINKS = ("palm", "finger1", "finger2")
@@ -40,103 +43,69 @@ def uniform(vertices):
     return area, corner + centroid, second - area * centroid @ centroid
 
 
-@dataclass(frozen=True)
-class Contact:
-    """`kind` "v": vertex `feature` on the link's edge; "e": the fingertip on edge `feature`. `link` 0 is the palm."""
-
-    link: int
-    kind: str
-    feature: int
-    rolls: bool = False
-
-
-def contact(text):
-    """`finger1:v2` or `palm:v6 rolling` as a `Contact`."""
-    name, *rolls = text.split()
-    link, feature = name.split(":")
-    return Contact(LINKS.index(link), feature[0], int(feature[1:]), rolls == ["rolling"])
+def constraint_rows(contacts):
+    """Link, kind (0 vertex, 1 edge), feature and whether tangential, one row a constraint: two for `... rolling`."""
+    rows = []
+    for text in contacts:
+        name, *rolls = text.split()
+        link, feature = name.split(":")
+        row = LINKS.index(link), "ve".index(feature[0]), int(feature[1:])
+        rows += [(*row, False)] + ([(*row, True)] if rolls else [])
+    return np.array(rows)
 
 
 class Model:
-    """One formation from plain numbers, nested as in a scene file."""
+    """One formation from plain numbers in SI units, nested as in a scene file."""
 
     def __init__(self, data, contacts):
         fingers = [data["hand"]["finger1"], data["hand"]["finger2"]]
-        self.joint = np.array([f["joint"] for f in fingers])
-        self.length = np.array([f["length"] for f in fingers])
-        self.offset = np.array([f.get("offset", 0.0) for f in fingers])
-        self.viscous = np.array([f.get("viscous", 0.0) for f in fingers])
-        self.dry = np.array([f.get("dry", 0.0) for f in fingers])
         solid = data["object"]
         area, centroid, second = uniform(solid["vertices"])
         assert "center_of_mass" not in solid
-        self.vertices = np.array(solid["vertices"]) - centroid
-        self.mass = solid["mass"]
-        self.inertia = solid.get("inertia", self.mass * second / area)
-        self.mass_matrix = np.diag([self.mass, self.mass, self.inertia, *(f["inertia"] for f in fingers)])
-        gravity = data["gravity"]
-        self.gravity = np.array([0.0, -gravity] if np.isscalar(gravity) else gravity)
-        self.contacts = [contact(text) for text in contacts]
-        friction = solid["friction"]
+        vertices, self.mass = np.array(solid["vertices"]) - centroid, solid["mass"]
+        inertia = [
+            self.mass,
+            self.mass,
+            solid.get("inertia", self.mass * second / area),
+            *(f["inertia"] for f in fingers),
+        ]
+        gravity, friction = data["gravity"], solid["friction"]
+        rows = constraint_rows(contacts)
+        self.rolls = np.append(rows[1:, 3] > 0, False)[rows[:, 3] == 0]
         each = friction if isinstance(friction, dict) else dict.fromkeys(LINKS, friction)
-        self.friction = np.array([each[LINKS[c.link]] for c in self.contacts])
-        self.rolls = np.array([c.rolls for c in self.contacts])
 
-    # --- gaps, their gradients, slips and what is left of the second derivative without acceleration -----------------
+        def of_fingers(key, default=0.0):
+            return np.array([[f.get(key, default) for f in fingers]])
 
-    def _contact(self, c, z, z_dot):
-        """Gap, `G_n`, `G_t` and `G_n_dot z_dot` of one contact."""
-        q, phi = z[:2], z[2]
-        turn = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]])
-        vertex = turn @ self.vertices[c.feature]
-        gap_row, slip_row = np.zeros((2, 5), np.result_type(z, z_dot))
-        rate = z_dot[2]
-        if c.link == 0:
-            gap_row[:3] = 0.0, 1.0, vertex[0]
-            slip_row[:3] = 1.0, 0.0, -vertex[1]
-            return q[1] + vertex[1], gap_row, slip_row, -vertex[1] * rate**2
-        finger, side = c.link - 1, (1.0 if c.link == 1 else -1.0)
-        spin = z_dot[3 + finger]
-        along = np.array([np.cos(z[3 + finger]), np.sin(z[3 + finger])])
-        normal = side * quarter(along)
-        velocity = z_dot[:2] + rate * quarter(vertex)
-        if c.kind == "v":
-            reach = q + vertex - self.joint[finger]
-            tangent = -quarter(normal)
-            gap = normal @ reach - self.offset[finger]
-            gap_row[:3] = *normal, normal @ quarter(vertex)
-            gap_row[3 + finger] = -side * (along @ reach)
-            slip_row[:3] = *tangent, tangent @ quarter(vertex)
-            slip_row[3 + finger] = -(tangent @ quarter(reach))
-            left = -2 * side * spin * (along @ velocity) - spin**2 * (normal @ reach) - rate**2 * (normal @ vertex)
-            return gap, gap_row, slip_row, left
-        after = turn @ self.vertices[(c.feature + 1) % len(self.vertices)]
-        edge = (after - vertex) / np.sqrt((after - vertex) @ (after - vertex))
-        normal = quarter(edge)
-        arm = self.length[finger] * along + self.offset[finger] * side * quarter(along)
-        tip = self.joint[finger] + arm
-        away = q + vertex - tip
-        tangent = edge
-        gap_row[:3] = *normal, quarter(normal) @ away + normal @ quarter(vertex)
-        gap_row[3 + finger] = -(normal @ quarter(arm))
-        slip_row[:3] = *tangent, tangent @ quarter(tip - q)
-        slip_row[3 + finger] = -(tangent @ quarter(arm))
-        left = (
-            -(rate**2) * (normal @ away)
-            + 2 * rate * (quarter(normal) @ (velocity - spin * quarter(arm)))
-            + normal @ (-(rate**2) * vertex + spin**2 * arm)
+        self.contacts = mechanics.Model(
+            vertices=vertices[None],
+            count=np.array([len(vertices)]),
+            friction=np.array([[each[link] for link in LINKS]]),
+            joint=of_fingers("joint"),
+            length=of_fingers("length"),
+            offset=of_fingers("offset"),
+            inertia=np.array([inertia]),
+            viscous=of_fingers("viscous"),
+            dry=of_fingers("dry"),
+            gravity=self.mass * np.array([[0.0, -gravity] if np.isscalar(gravity) else gravity]),
+            formation=tuple(rows[None, :, k] for k in range(3)),
+            tangential=rows[None, :, 3] > 0,
         )
-        return normal @ away, gap_row, slip_row, left
+        self.normal = rows[:, 3] == 0
+        self.friction = self.contacts.friction[0, self.normal]
+
+    def _geometry(self, z, z_dot):
+        return mechanics.Geometry(*(value[0, 0] for value in self.contacts.geometry(z[None, None], z_dot[None, None])))
 
     def geometry(self, z, z_dot):
         """Gaps, `G_n`, `G_t` and `G_n_dot z_dot` of all contacts."""
-        return [np.array(column) for column in zip(*(self._contact(c, z, z_dot) for c in self.contacts), strict=True)]
+        at, rows = self._geometry(z, z_dot), self.normal
+        return at.gap[rows], at.normal_rows[rows], at.slip_rows[rows], at.left[rows]
 
     def rolling(self, z, z_dot):
         """`G_t` and `G_t_dot z_dot` of the contacts that roll."""
-        step = 1e-30
-        beside = self.geometry(z + 1j * step * z_dot, z_dot)[2]
-        return self.geometry(z, z_dot)[2][self.rolls], (beside.imag / step @ z_dot)[self.rolls]
+        at = self._geometry(z, z_dot)
+        return at.normal_rows[~self.normal], at.left[~self.normal]
 
     def reversing(self, z, z_dot):
         """Slip velocities (0 for contacts that roll) and joint speeds: what must not change sign within a segment."""
@@ -144,32 +113,31 @@ class Model:
 
     def matrix(self, z, z_dot, signs):
         """The matrix of the equations of motion and of the constraints, and `G_dot z_dot` of the latter."""
-        _, gap_rows, slip_rows, left = self.geometry(z, z_dot)
-        wrench = gap_rows - (self.friction * np.where(self.rolls, 0.0, signs[:-2]))[:, None] * slip_rows
-        held_rows, held_left = self.rolling(z, z_dot)
-        wrench, gap_rows = np.concatenate([wrench, held_rows]).T, np.concatenate([gap_rows, held_rows])
-        left = np.concatenate([left, held_left])
-        return np.block([[self.mass_matrix, -wrench], [gap_rows, np.zeros((len(left), len(left)))]]), left
+        at, rows = self._geometry(z, z_dot), self.normal
+        slipping = (self.friction * np.where(self.rolls, 0.0, signs[:-2]))[:, None] * at.slip_rows[rows]
+        wrench = np.concatenate([at.normal_rows[rows] - slipping, at.normal_rows[~rows]]).T
+        constraint = np.concatenate([at.normal_rows[rows], at.normal_rows[~rows]])
+        left = np.concatenate([at.left[rows], at.left[~rows]])
+        mass = np.diag(self.contacts.inertia[0])
+        return np.block([[mass, -wrench], [constraint, np.zeros((len(left), len(left)))]]), left
 
     def solve(self, z, z_dot, torque, signs):
         """Accelerations (5) and constraint forces (every `c_n`, then `c_t` of those that roll) for given signs of slips
         and joint speeds (2)."""
         matrix, left = self.matrix(z, z_dot, signs)
-        force = np.concatenate([self.mass * self.gravity, [0.0], torque])
-        force[3:] -= self.viscous * z_dot[3:] + self.dry * signs[-2:]
+        force = self.contacts.applied(z_dot[None, None], torque, signs[-2:])[0, 0]
         answer = np.linalg.solve(matrix, np.concatenate([force, -left]))
         return answer[:5], answer[5:]
 
     def direction(self, z, toward):
-        """The unit tangent of the wire at `z`, oriented by a coordinate and a sign such as `x-`."""
-        rows = np.concatenate([self.geometry(z, np.zeros(5))[1], self.rolling(z, np.zeros(5))[0]])
-        null = np.linalg.svd(rows)[2][-1]
+        """The unit tangent of the path at `z`, oriented by a coordinate and a sign such as `x-`."""
+        null = np.linalg.svd(self._geometry(z, np.zeros(5)).normal_rows)[2][-1]
         return null if null[COORDINATES.index(toward[:-1])] * (1 if toward[-1] == "+" else -1) > 0 else -null
 
     # --- time ---------------------------------------------------------------------------------------------------------
 
     def simulate(self, z, toward, times, values, end, rtol=1e-12, atol=1e-14):
-        """Move from rest at `z` from `fused_matmul[0]` to `end` under a piecewise linear torque; rest is not
+        """Move from rest at `z` from `times[0]` to `end` under a piecewise linear torque; rest is not
         handled."""
         signs = np.sign(self.reversing(z, self.direction(z, toward)))
         state, segments, reversals = np.concatenate([z, np.zeros(5)]), [], []

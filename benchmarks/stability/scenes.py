@@ -12,7 +12,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from stability_model import Model, centroid_and_inertia
+
+from tests.reference.mechanics import Model, centroid_and_inertia
 
 CAPACITY = 16
 TOUCHING, SYMMETRIC, WEDGED, ROLLING, FREE = range(5)
@@ -22,12 +23,15 @@ KNOTS = 24
 ROLLS = np.array([[0, 0, 1, 2], [0, 1, 1, 2], [0, 1, 2, 2]])  # which of three contacts has two rows
 
 
+BLOCK = 2000  # scenes from one seed, so that results do not depend on how many processes share the work
+
+
 class Scenes(NamedTuple):
     """A batch of scenes in SI units, one row each; names as in `wholearm_jax.model.scene`.
 
     `uniform` says that the inertia follows from a uniform density; `exact` that `rough` lies within `jitter` of a
     configuration in which all contacts touch. `family` is a row of `FAMILIES`. `torque_kind` and what follows describe
-    the torque (see `stability.run_schedule`): `knots` are times as shares of the duration.
+    the torque (see `programs.drive`): `knots` are times as shares of the duration.
     """
 
     vertices: np.ndarray

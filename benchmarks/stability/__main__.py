@@ -1,17 +1,16 @@
 """Stability sweep: random scenes over many decades, each of which must end in a result that passes the checks or in the
 status that names the reason.
 
-    python benchmarks/stability.py [--count 100000] [--seed 1] [--quick]
+    python -m benchmarks.stability [--count 100000] [--seed 1] [--quick]
 
-The scenes come from `stability_scenes`, the package's own steps from `stability_programs`; what must hold is checked by
-`stability_checks`, on mechanics written a second time in `stability_model`. Wires are traced at the default resolution.
+The scenes come from `scenes`, the package's own steps from `programs`; what must hold is checked by
+`checks`, on mechanics written a second time in `tests.reference.mechanics`. Wires are traced at the default resolution.
 What that cannot resolve goes on to a finer table, and what needs more steps gets them, as `wholearm_jax.trace` and
 `simulate` do for one scene. A tenth of the scenes runs again in single precision.
 """
 
 import argparse
 import os
-import pickle
 import subprocess
 import sys
 import tempfile
@@ -20,24 +19,22 @@ from pathlib import Path
 
 import numpy as np
 
-STATUSES = (
-    *("ok", "contact_lost", "stuck", "reversed", "not_reached", "left_formation", "ambiguous", "singular"),
-    *("no_convergence", "max_steps"),
-)
-BLOCK = 2000  # scenes from one seed, so that results do not depend on how many processes share the work
+from benchmarks.stability import scenes
+
+ROOT = Path(__file__).parents[2]
 
 
 def main():
     options = parsed()
     if options.part is not None:
-        from stability_sweep import work
+        from benchmarks.stability.sweep import work
 
         return work(options.part, options.seed, single=options.single, target=Path(options.target))
     begun = time.perf_counter()
-    blocks = max(1, round(options.count / BLOCK))
+    blocks = max(1, round(options.count / scenes.BLOCK))
     double = collected(range(blocks), options, single=False)
     single = collected(range(max(1, blocks // 10)), options, single=True)
-    from stability_report import report
+    from benchmarks.stability.report import report
 
     report(double, single, options.seed, time.perf_counter() - begun, keep=not options.quick)
     return None
@@ -69,14 +66,22 @@ def collected(blocks, options, *, single):
     with tempfile.TemporaryDirectory() as folder:
         running = []
         for number, share in enumerate(s for s in shares if s):
-            target = Path(folder) / f"{number}.pickle"
-            command = [sys.executable, __file__, "--seed", str(options.seed), "--target", str(target)]
+            target = Path(folder) / f"{number}.npz"
+            command = [
+                sys.executable,
+                "-m",
+                "benchmarks.stability",
+                "--seed",
+                str(options.seed),
+                "--target",
+                str(target),
+            ]
             command += (["--single"] if single else []) + ["--part", *map(str, share)]
-            running.append((target, subprocess.Popen(command, env=surroundings)))
+            running.append((target, subprocess.Popen(command, env=surroundings, cwd=ROOT)))
         for _, process in running:
             if process.wait():
                 raise SystemExit("a process of the sweep failed")
-        parts = [pickle.loads(target.read_bytes()) for target, _ in running]
+        parts = [dict(np.load(target)) for target, _ in running]
     together = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     order = np.lexsort((together["row"], together["block"]))
     return {key: value[order] for key, value in together.items()}

@@ -1,7 +1,7 @@
 """The package's own steps on a batch of random scenes: trace, reduce, simulate, score, judge, and what they found.
 
 Each step is the public function of its module under one `vmap`: nothing is skipped and nothing is softened. Beside the
-outcome, the tables are read at places and times for `stability_checks` to look at.
+outcome, the tables are read at places and times for `checks` to look at.
 """
 
 from functools import cache
@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from stability_scenes import Scenes
 
+from benchmarks.stability.scenes import Scenes
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel, resolve_impact, tabulate_path_dynamics
 from wholearm_jax.margin import (
     best_quasistatic_torque_batch,

@@ -1,4 +1,5 @@
-"""What must hold of a traced, simulated and judged scene: residuals and violations, by `stability_model` in NumPy.
+"""What must hold of a traced, simulated and judged scene: residuals and violations, by `tests.reference.mechanics` in
+NumPy.
 
 Every function takes batches with a leading axis of scenes. Residuals are relative: an equation's error against its
 largest term. Violations are counted by name; a scene may have several.
@@ -7,7 +8,8 @@ largest term. Violations are counted by name; a scene may have several.
 from typing import NamedTuple
 
 import numpy as np
-from stability_model import Model, dot
+
+from tests.reference.mechanics import Model, dot
 
 OK, LOST, STUCK, REVERSED, NOT_REACHED, LEFT, AMBIGUOUS, SINGULAR, NO_CONVERGENCE, MAX_STEPS = range(10)
 MADE, BEYOND, UNTIL = 1, 2, 3  # why a wire ends

@@ -1,6 +1,5 @@
 """The work of one process of the stability sweep: trace, simulate and check blocks of scenes, level by level."""
 
-import pickle
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -8,16 +7,19 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import stability_checks as checks
-from stability import BLOCK, STATUSES
-from stability_model import Model, dot
-from stability_programs import FLOATS, GAUSS, follower, forward, reverse, tracer
-from stability_scenes import Scenes, draw
 
+from benchmarks.stability import checks
+from benchmarks.stability.programs import FLOATS, GAUSS, follower, forward, reverse, tracer
+from benchmarks.stability.scenes import BLOCK, Scenes, draw
+from tests.reference.mechanics import Model, dot
 from wholearm_jax.core import configure
 from wholearm_jax.simulation import IntegratorOptions
 from wholearm_jax.tracing import Resolution
 
+STATUSES = (
+    *("ok", "contact_lost", "stuck", "reversed", "not_reached", "left_formation", "ambiguous", "singular"),
+    *("no_convergence", "max_steps"),
+)
 REASONS = (
     "",
     "contacts do not touch",
@@ -81,7 +83,7 @@ def work(blocks, seed, *, single, target: Path):
         wrong = int((found["violations"] != 0).sum())
         print(f"block {block}: {time.perf_counter() - begun:.0f} s; {named}; {wrong} violations", flush=True)
     together = {key: np.concatenate([r[key] for r in records]) for key in records[0]}
-    target.write_bytes(pickle.dumps(together))
+    np.savez(target, **together)
 
 
 def swept(scenes: Scenes, precision: Precision) -> dict[str, np.ndarray]:

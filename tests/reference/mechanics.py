@@ -21,7 +21,7 @@ import numpy as np
 class Geometry(NamedTuple):
     """Contacts at configurations: gap, place along the feature, `G_n`, `G_t` and `G_n_dot z_dot`.
 
-    In the second row of a contact that rolls, `gap` is how far it has left its place, and `normal_jacobian` its `G_t`.
+    In the second row of a contact that rolls, `gap` is how far it has left its place, and `normal_rows` its `G_t`.
     """
 
     gap: np.ndarray
@@ -69,7 +69,8 @@ class Model:
 
     @classmethod
     def in_object_units(cls, shape, formation, friction, joint_inertia):
-        """From shapes of `stability_scenes` (unit size and mass), for the geometry and friction alone."""
+        """From shapes of the stability benchmark's `scenes` (unit size and mass), for the geometry and friction
+        alone."""
         n = len(shape.count)
         zero, body = np.zeros((n, 2)), np.stack([np.ones(n), np.ones(n), np.full(n, 0.3)], axis=1)
         return cls(
@@ -89,7 +90,7 @@ class Model:
 
     @classmethod
     def of(cls, scenes, rows=slice(None)):
-        """From `stability_scenes.Scenes`, which are in SI units."""
+        """From `benchmarks.stability.scenes.Scenes`, which are in SI units."""
         some = scenes[rows]
         center, second = centroid_and_inertia(some.vertices, some.count)
         vertices = some.vertices - center[:, None]
@@ -166,7 +167,9 @@ class Model:
         d = np.take_along_axis(directions, self.link[:, None, :, None], axis=2)
         q, q_dot, rate = z[..., None, :2], z_dot[..., None, :2], z_dot[..., None, 2]
         spins = np.concatenate([np.zeros_like(z_dot[..., :1]), z_dot[..., 3:]], axis=-1)
-        spin = np.take_along_axis(spins, np.broadcast_to(self.link[:, None], (*z.shape[:2], 4)), axis=2)
+        spin = np.take_along_axis(
+            spins, np.broadcast_to(self.link[:, None], (*z.shape[:2], self.link.shape[1])), axis=2
+        )
         arm = length * d + offset * side * quarter(d)
 
         normal = np.where(tip_on_edge[..., None], quarter(edge), side * quarter(d))

@@ -3,11 +3,11 @@
 import json
 
 import numpy as np
-from measure import RESULTS, save
-from stability import STATUSES
-from stability_checks import DOUBLE, SINGLE, VIOLATIONS
-from stability_scenes import FAMILIES
-from stability_sweep import EXCESSES, REASONS, RESIDUALS
+
+from benchmarks.measure import RESULTS, save
+from benchmarks.stability.checks import DOUBLE, SINGLE, VIOLATIONS
+from benchmarks.stability.scenes import FAMILIES
+from benchmarks.stability.sweep import EXCESSES, REASONS, RESIDUALS, STATUSES
 
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#999999"
