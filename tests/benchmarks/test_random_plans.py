@@ -11,7 +11,7 @@ import wholearm_jax as wa
 
 @pytest.fixture
 def benchmarks(monkeypatch):
-    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
     yield
     for name in ("random_plans", "flying_plans"):
         sys.modules.pop(name, None)
