@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 import wholearm_jax as wa
-from wholearm_jax.plotting import draw_forces, draw_result, draw_strip
+from wholearm_jax.plotting import plot_forces, plot_result, plot_strip
 
 wa.configure()
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out")
@@ -17,6 +17,6 @@ for phase, fraction in zip(optimum.result.phases, optimum.bound_fraction, strict
     print(f"{phase.name}: {phase.margin:.3f} N, {fraction:.1%} of the upper bound")
 
 wa.write_torque(optimum.torque, folder / "torque.csv")
-draw_strip(optimum.result).flat[0].figure.savefig(folder / "plan.png")
-draw_result(optimum.result)[0].figure.savefig(folder / "result.png")
-draw_forces(optimum.result).figure.savefig(folder / "forces.png")  # every plot takes axes of your own, too
+plot_strip(optimum.result).flat[0].figure.savefig(folder / "plan.png")
+plot_result(optimum.result)[0].figure.savefig(folder / "result.png")
+plot_forces(optimum.result).figure.savefig(folder / "forces.png")  # every plot takes axes of your own, too

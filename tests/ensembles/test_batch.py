@@ -21,8 +21,8 @@ from wholearm_jax.ensembles.passes import check_block, trace_block
 from wholearm_jax.ensembles.scene_batch import stack_scenes
 from wholearm_jax.ensembles.scene_check import COARSE_PASS, BatchResult, NextPass, check_scene, from_result
 from wholearm_jax.ensembles.summary import rank_correlations, summarise
-from wholearm_jax.files.check_store import StoreError, fingerprint, identity, open_store
-from wholearm_jax.files.polygons_npz import how_many, read_polygons
+from wholearm_jax.files.check_store import StoreError, fingerprint, open_store, store_metadata
+from wholearm_jax.files.polygons_npz import count_polygons, read_polygons
 from wholearm_jax.files.scene_toml import SceneError, to_dict
 from wholearm_jax.model.outline import find_defect
 from wholearm_jax.model.schedule import TorqueSchedule, pad_schedule
@@ -258,7 +258,7 @@ def test_the_survey_says_what_fails_where(scene, monkeypatch):
 
 
 def test_what_a_store_is_of(tmp_path, scene, schedule):
-    wanted = identity(10, 4, seed=1)
+    wanted = store_metadata(10, 4, seed=1)
     open_store(tmp_path / "a.zarr", wanted)
     with pytest.raises(StoreError, match="another version"):
         open_store(tmp_path / "a.zarr", wanted | {"version": "0.0"})
@@ -277,7 +277,7 @@ def test_what_a_store_is_of(tmp_path, scene, schedule):
 def test_a_store_left_half_made_is_made_again_and_a_half_written_chunk_is_not_done(tmp_path):
     import zarr
 
-    wanted, path = identity(4, 2, seed=1), tmp_path / "half.zarr"
+    wanted, path = store_metadata(4, 2, seed=1), tmp_path / "half.zarr"
     zarr.create_group(str(path)).create_array("margin", shape=(4,), dtype="float64")  # killed before it said what it is
     store = open_store(path, wanted)
     assert store.chunks == 2
@@ -288,7 +288,7 @@ def test_a_store_left_half_made_is_made_again_and_a_half_written_chunk_is_not_do
 
 
 def test_a_store_of_something_else_is_refused(tmp_path):
-    wanted = identity(10, 4, seed=1)
+    wanted = store_metadata(10, 4, seed=1)
     open_store(tmp_path / "a.zarr", wanted)
     assert open_store(tmp_path / "a.zarr", wanted).chunks == 3
     with pytest.raises(StoreError, match="another seed"):
@@ -302,7 +302,7 @@ def test_a_store_of_something_else_is_refused(tmp_path):
 
 def test_a_store_goes_on_and_ends_the_same(tmp_path, ensemble, schedule):
     """Chunk by chunk, in another order, over a chunk left half written: bit for bit the same."""
-    wanted = identity(COUNT, 2, seed=SEED)
+    wanted = store_metadata(COUNT, 2, seed=SEED)
     whole, broken = (open_store(tmp_path / name, wanted) for name in ("whole", "broken"))
     found = dict(check_in_chunks(ensemble, schedule, COUNT, chunk=2, arrival=ARRIVAL))
     for number, part in found.items():
@@ -348,7 +348,7 @@ def test_bad_input_of_the_command(tmp_path, monkeypatch, capsys, arguments, said
 
 def test_scenes_that_vary_arrive_as_the_command_line_says():
     """In Python as by `wholearm check`: near the end, as no varied plan ends where torques were not made for it."""
-    assert inspect.signature(wa.check).parameters["arrival"].default == batch_command.ARRIVAL
+    assert inspect.signature(wa.check).parameters["arrival"].default == batch_command.ARRIVAL_FRACTION
 
 
 SEVEN = np.array([[2.0, 0], [1, 1.6], [-0.4, 1.9], [-1.8, 0.9], [-1.8, -0.9], [-0.4, -1.9], [1.2, -1.6]])
@@ -391,11 +391,11 @@ def test_friction_of_polygons_is_by_polygon_and_link(tmp_path, scene, given):
     np.testing.assert_array_equal(friction, np.repeat(row[:, None], 3, 1) if np.ndim(given) == 1 else [row] * 3)
 
 
-def test_how_many_polygons_there_are(tmp_path):
+def test_count_polygons(tmp_path):
     np.savez(tmp_path / "objects.npz", vertices=np.stack([SEVEN] * 3))
-    assert how_many(tmp_path / "objects.npz") == 3
+    assert count_polygons(tmp_path / "objects.npz") == 3
     (tmp_path / "other.npz").write_text("none")
-    assert how_many(tmp_path / "other.npz") == how_many(tmp_path / "absent.npz") == 0
+    assert count_polygons(tmp_path / "other.npz") == count_polygons(tmp_path / "absent.npz") == 0
 
 
 def test_one_scene_is_not_many(scene, schedule):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from wholearm_jax.ensembles.scene_check import BatchResult
-from wholearm_jax.files.check_store import TYPES, StoreError, identity, open_store
+from wholearm_jax.files.check_store import TYPES, StoreError, open_store, store_metadata
 
 zarr = pytest.importorskip("zarr")
 COUNT, CHUNK, KILLS = 12, 1, 2
@@ -111,7 +111,7 @@ def test_several_processes_leave_what_one_does(command, whole, tmp_path, number)
 
 
 def test_a_full_disk_is_an_error_and_what_is_there_stays(tmp_path, monkeypatch):
-    wanted = identity(4, 2, seed=1)
+    wanted = store_metadata(4, 2, seed=1)
     store = open_store(tmp_path / "full.zarr", wanted)
     ones = BatchResult(*(np.ones((2, *shape)) for shape in ((), (), (), (), (), (5,))))
     store.write(0, ones._asdict())

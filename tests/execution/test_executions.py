@@ -36,7 +36,7 @@ from wholearm_jax.files.results import _perturbed_row, write_execution
 from wholearm_jax.model.kinematics import contact_kinematics, contact_set, normal_jacobian
 from wholearm_jax.model.mechanics import scaled_mechanics
 from wholearm_jax.model.scene import contact_formation, parse_contact, rigid_body
-from wholearm_jax.plotting.execution_figures import animate, draw_execution, draw_execution_strip
+from wholearm_jax.plotting.execution_figures import animate, plot_execution, plot_execution_strip
 
 DATA = Path(__file__).parents[1] / "data"
 NAMES = ("heptagon", "hexagon")
@@ -414,10 +414,10 @@ def test_figures(executions, tmp_path):
     import matplotlib.pyplot as plt
 
     done = executions["heptagon"]
-    axes = draw_execution(done)
+    axes = plot_execution(done)
     labels = [text.get_text() for text in axes[2].get_yticklabels()]
     assert set(labels) >= set(done.planned)
-    draw_execution_strip(done, 4)[0, 0].figure.savefig(tmp_path / "strip.png")
+    plot_execution_strip(done, 4)[0, 0].figure.savefig(tmp_path / "strip.png")
     animate(done, 2).save(tmp_path / "motion.gif", writer="pillow")
     assert (tmp_path / "motion.gif").stat().st_size > 5_000
     plt.close("all")

@@ -12,11 +12,11 @@ from wholearm_jax.plotting.palette import CONTACT_COLOURS, DASHES, contact_style
 from wholearm_jax.plotting.plan_figures import (
     COLUMN,
     PAPER,
-    draw_forces,
-    draw_pose,
-    draw_result,
-    draw_strip,
-    draw_torques,
+    plot_forces,
+    plot_pose,
+    plot_result,
+    plot_strip,
+    plot_torques,
 )
 
 mpl.use("agg")
@@ -38,7 +38,7 @@ def closed():
     plt.close("all")
 
 
-@pytest.mark.parametrize("draw", [draw_torques, draw_forces])
+@pytest.mark.parametrize("draw", [plot_torques, plot_forces])
 def test_draws_on_the_axes_given(draw, pushed):
     _, (used, other) = plt.subplots(1, 2)
     assert draw(pushed, used) is used
@@ -49,14 +49,14 @@ def test_draws_on_the_axes_given(draw, pushed):
 
 def test_results_compose(pushed):
     figure, grid = plt.subplots(2, 2)
-    assert list(draw_result(pushed, grid[:, 0])) == list(grid[:, 0])
-    assert list(draw_strip(pushed, axes=grid[:, 1:].T)[0]) == list(grid[:, 1])
+    assert list(plot_result(pushed, grid[:, 0])) == list(grid[:, 0])
+    assert list(plot_strip(pushed, axes=grid[:, 1:].T)[0]) == list(grid[:, 1])
     assert len(grid[1, 1].patches) == 1  # the object
     assert figure.axes == list(grid.flat)  # none was added
 
 
 def test_forces_show_the_margin_and_every_contact(pushed):
-    ax = draw_forces(pushed)
+    ax = plot_forces(pushed)
     legend = ax.get_legend()
     assert legend is not None
     assert [text.get_text() for text in legend.get_texts()] == list(pushed.phases[0].contacts)
@@ -66,13 +66,13 @@ def test_forces_show_the_margin_and_every_contact(pushed):
 
 
 def test_pose_numbers_its_vertices(pushed):
-    ax = draw_pose(pushed.scene, pushed.scene.start, numbers=True)
+    ax = plot_pose(pushed.scene, pushed.scene.start, numbers=True)
     assert [text.get_text() for text in ax.texts] == [str(k) for k in range(7)]
 
 
 def test_settings_of_a_paper(pushed):
     with plt.rc_context(PAPER):
-        figure = draw_result(pushed)[0].figure
+        figure = plot_result(pushed)[0].figure
         assert mpl.rcParams["font.size"] == 8
         assert mpl.rcParams["pdf.fonttype"] == 42
     assert figure.get_size_inches()[0] == COLUMN

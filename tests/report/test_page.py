@@ -11,7 +11,7 @@ from wholearm_jax.files.results import summary, write_summary, write_torque, wri
 from wholearm_jax.files.scene_toml import SceneError, load, parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan_simulation import simulate
-from wholearm_jax.report.page import _worst, read_result, render, report
+from wholearm_jax.report.page import _worst, load_result_folder, render, report
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 CHROMIUM = next((path for path in map(shutil.which, NAMES) if path), None)
@@ -77,7 +77,7 @@ def test_page_holds_everything_it_needs(folder):
 
 
 def test_a_plan_without_motion(folder):
-    written = read_result(folder)
+    written = load_result_folder(folder)
     failed = written.summary | {"status": "singular", "margin": None, "message": "near: singular"}
     blank = {"status": "singular", "margin": None, "margin_time": None, "bound": None}
     failed["phases"] = [row | blank for row in failed["phases"]]

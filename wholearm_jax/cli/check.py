@@ -1,14 +1,12 @@
-"""`wholearm check`: one schedule against very many scenes, in a store that can be gone on with.
+"""`wholearm check`: one schedule against very many scenes, in a store that the same command can resume.
 
-Every process of a run (`--coordinator`, or SLURM's variables) takes each `--processes`-th chunk; the first one makes
-the store and tells what became of all. Each process has one device for every processor that it may run on.
+Every process of a run (`--coordinator`, or SLURM's variables) computes each `--processes`-th chunk; the first process
+makes the store, and summarises it at the end. Each process has one device for every processor that it may run on.
 """
 
-import os
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,26 +14,27 @@ from typing import Annotated, Any
 import typer
 
 from wholearm_jax.cli.arguments import (
-    TORQUE,
+    ARRIVAL_FRACTION,
+    TORQUE_HELP,
     BadInput,
     SceneName,
-    counting_progress,
-    note,
-    note_limit_violations,
-    writing,
+    parse_ensemble,
+    refuse_unwritable,
 )
+from wholearm_jax.cli.prediction import note, note_limit_violations
+from wholearm_jax.cli.processes import ProcessRank, join_processes, use_all_processors
+from wholearm_jax.cli.progress import count_progress
 from wholearm_jax.core import configure
 
-BESIDE = (".json", ".png", ".svg", ".pdf")  # what stands beside a store, under its name
-MANY = 250_000  # scenes from which on compiling well, which takes 1.5 times as long, pays (`benchmarks/batch.py`)
-ARRIVAL = 0.01  # share of the wire: perturbed plans cannot end where an unperturbed one must
+SUMMARY_SUFFIXES = (".json", ".png", ".svg", ".pdf")  # of the files beside a store that bear its name
+WELL_COMPILED_COUNT = 250_000  # scenes from which on compiling for run time pays (`benchmarks/batch.py`)
 Vary = Annotated[list[str] | None, typer.Option("--vary", help="QUANTITY=AMOUNT, e.g. vertices=0.0005, friction=20%.")]
 
 
 def check(
     scene: SceneName,
     out: Annotated[Path, typer.Option(help="The Zarr store of results; a summary and figures stand beside it.")],
-    torque: Annotated[Path | None, typer.Option(help=f"{TORQUE} Needed unless --optimise is given.")] = None,
+    torque: Annotated[Path | None, typer.Option(help=f"{TORQUE_HELP} Needed unless --optimise is given.")] = None,
     vary: Vary = None,
     polygons: Annotated[Path | None, typer.Option(help="Objects to put in the scene, .npz.")] = None,
     count: Annotated[int | None, typer.Option(min=1, help="How many scenes to draw.")] = None,
@@ -45,7 +44,7 @@ def check(
         typer.Option(
             min=1e-9, max=1.0, help="Arrived: this near the wire's end, as a share of its length; 1e-6 for --optimise."
         ),
-    ] = ARRIVAL,
+    ] = ARRIVAL_FRACTION,
     tolerance: Annotated[
         float, typer.Option(min=1e-12, max=1e-3, help="Of margins [N]; below 1e-9, all is computed as by `simulate`.")
     ] = 1e-6,
@@ -61,88 +60,45 @@ def check(
         raise BadInput("check: give either --count, with --vary QUANTITY=AMOUNT, or --polygons FILE.npz")
     if torque is None and not optimise:
         raise BadInput("check: give --torque FILE, or --optimise")
-    if out.suffix in BESIDE:
+    if out.suffix in SUMMARY_SUFFIXES:
         raise BadInput(f"--out {out}: {out.suffix} is what stands beside the store; name the store otherwise, as .zarr")
-    from wholearm_jax.files import how_many, read_polygons
+    from wholearm_jax.files import count_polygons, read_polygons
 
-    many = how_many(polygons) if polygons else count or 0
-    configure(compiled="quickly" if many < MANY else "well")
-    _use_all_processors()
-    place = _join(coordinator, processes, process)
+    expected = count_polygons(polygons) if polygons else count or 0
+    configure(compiled="quickly" if expected < WELL_COMPILED_COUNT else "well")
+    use_all_processors()
+    rank = join_processes(coordinator, processes, process)
+    loaded = _load_moving(scene)
+    schedule = None if optimise or torque is None else _read_schedule(loaded, torque, rank)
+    if optimise and torque is not None and rank.is_first:
+        note(f"with --optimise each scene gets a schedule of its own: {torque} is not followed")
+    source = read_polygons(polygons, loaded) if polygons else parse_ensemble(loaded, vary, seed)
+    total = count if count is not None else int(source.scenes.object.mass.shape[0])  # pyright: ignore
+    limits = {"arrival": None, "tolerance": None} if optimise else {"arrival": arrival, "tolerance": tolerance}
+    settings = limits | {"optimise": knots if optimise else None, "seed": seed}
+    _run(_Job(source, schedule, settings, total, min(chunk, total), optimise, knots), loaded, out, rank)
+    sys.exit(0)
+
+
+def _load_moving(name: str):
+    """Load a scene whose phases all move, once Zarr is known to be there."""
     try:
         import zarr  # noqa: F401
     except ModuleNotFoundError:
         raise BadInput("checking many scenes needs Zarr: pip install 'wholearm_jax[batch]'") from None
     from wholearm_jax.files import load
-    from wholearm_jax.files.check_store import StoreError, fingerprint, identity
     from wholearm_jax.phases import require_motion
 
-    loaded = load(scene)
+    scene = load(name)
     try:
-        require_motion(loaded)
+        require_motion(scene)
     except ValueError as error:
-        raise BadInput(f"{scene}: {error}") from None
-    schedule = None if optimise or torque is None else _followed(loaded, torque, place)
-    if optimise and torque is not None and place.first:
-        note(f"with --optimise each scene gets a schedule of its own: {torque} is not followed")
-    source = read_polygons(polygons, loaded) if polygons else ensemble(loaded, vary, seed)
-    total = count if count is not None else int(source.scenes.object.mass.shape[0])  # pyright: ignore
-    judged = {"arrival": None, "tolerance": None} if optimise else {"arrival": arrival, "tolerance": tolerance}
-    settings = judged | {"optimise": knots if optimise else None, "seed": seed}
-    settings |= {"scenes": fingerprint(source), "torque": fingerprint(schedule)}
-    job = _Job(source, schedule, settings, total, min(chunk, total), optimise, knots)
-    try:
-        store = _shared_store(out, identity(total, job.chunk, **settings), job, place)
-        _fill(store, job, place)
-        place.meet("filled")
-        if place.first:
-            told = _report(store, loaded, source, out)
-            print("\n".join(told.lines))
-    except StoreError as error:
-        raise BadInput(str(error)) from None
-    sys.exit(0)
+        raise BadInput(f"{name}: {error}") from None
+    return scene
 
 
-@dataclass(frozen=True)
-class _Place:
-    """This process among those of a run."""
-
-    number: int
-    count: int
-
-    @property
-    def first(self) -> bool:
-        return self.number == 0
-
-    def meet(self, name: str) -> None:
-        """Wait for the others."""
-        if self.count > 1:
-            from jax.experimental.multihost_utils import sync_global_devices
-
-            sync_global_devices(name)
-
-
-@dataclass(frozen=True)
-class _Job:
-    """What is to be computed."""
-
-    source: Any
-    torque: Any
-    settings: dict[str, Any]
-    count: int
-    chunk: int
-    optimise: bool
-    knots: int
-
-    @property
-    def rows(self) -> int:
-        """Rows of the schedule that each scene has for itself; 0 where all follow the given one."""
-        scene = self.source.draw(0)
-        return self.knots * len(scene.phases) if self.optimise else 0
-
-
-def _followed(scene, torque: Path, place: _Place):
-    """The schedule that all scenes follow."""
+def _read_schedule(scene, torque: Path, rank: ProcessRank):
+    """Read the schedule that all scenes follow."""
     from wholearm_jax.files import read_torque
     from wholearm_jax.phases import require_covered
 
@@ -151,71 +107,64 @@ def _followed(scene, torque: Path, place: _Place):
         require_covered(scene, schedule)
     except ValueError as error:
         raise BadInput(f"{torque}: {error}") from None
-    if place.first:
+    if rank.is_first:
         note_limit_violations(scene, schedule, torque)
     return schedule
 
 
-def ensemble(scene, amounts: list[str] | None, seed: int):
-    """The ensemble that `QUANTITY=AMOUNT` arguments describe."""
-    from wholearm_jax.ensembles import make_ensemble
+@dataclass(frozen=True)
+class _Job:
+    """The scenes to compute, and how."""
 
-    pairs = [text.partition("=") for text in amounts or ()]
+    source: Any  # of scenes: an ensemble or a batch
+    torque: Any  # the schedule that all follow; None with `optimise`
+    settings: dict[str, Any]
+    count: int  # of scenes
+    chunk: int  # scenes a chunk
+    optimise: bool
+    knots: int  # a phase, with `optimise`
+
+    @property
+    def schedule_rows(self) -> int:
+        """Rows of the schedule that each scene has for itself; 0 where all follow the given one."""
+        return self.knots * len(self.source.draw(0).phases) if self.optimise else 0
+
+
+def _run(job: _Job, scene, out: Path, rank: ProcessRank) -> None:
+    """Fill the store with all other processes; the first process prints and writes the summary."""
+    from wholearm_jax.files.check_store import StoreError, fingerprint, store_metadata
+
+    digests = {"scenes": fingerprint(job.source), "torque": fingerprint(job.torque)}
+    metadata = store_metadata(job.count, job.chunk, **job.settings, **digests)
     try:
-        return make_ensemble(scene, {name.strip(): amount.strip() for name, _, amount in pairs}, seed=seed)
-    except ValueError as error:
-        raise BadInput(f"{error}") from None
+        store = _open_shared_store(out, metadata, job, rank)
+        _fill(store, job, rank)
+        rank.wait_for_others("filled")
+        if rank.is_first:
+            print("\n".join(_summarise(store, scene, job.source, out).lines))
+    except StoreError as error:
+        raise BadInput(str(error)) from None
 
 
-def _use_all_processors() -> None:
-    """One device for each processor, unless JAX has been told how many there are."""
-    import jax
-
-    told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if not told and jax.config.values["jax_num_cpu_devices"] < 0:
-        mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
-        with suppress(RuntimeError):  # in a process that has used JAX before, it stays at what there is
-            jax.config.update("jax_num_cpu_devices", len(mine))
-
-
-def _join(coordinator: str | None, processes: int | None, process: int | None) -> _Place:
-    """Join the other processes of a run, if there are any."""
-    given = [value is not None for value in (coordinator, processes, process)]
-    slurm = int(os.environ.get("SLURM_NTASKS", "1")) > 1 and "SLURM_PROCID" in os.environ
-    if not any(given) and not slurm:
-        return _Place(0, 1)
-    if any(given) and not all(given):
-        raise BadInput("several processes: give all of --coordinator HOST:PORT, --processes and --process")
-    if process is not None and processes is not None and process >= processes:
-        raise BadInput(f"--process {process}: there are only {processes}, counted from 0")
-    import jax
-
-    try:
-        jax.distributed.initialize(coordinator, processes, process)
-    except (RuntimeError, ValueError) as error:
-        raise BadInput(f"--coordinator {coordinator}: {str(error).splitlines()[0]}") from None
-    return _Place(jax.process_index(), jax.process_count())
-
-
-def _shared_store(out: Path, wanted, job: _Job, place: _Place):
-    """The store; the first process makes it, the others open it then."""
+def _open_shared_store(out: Path, metadata, job: _Job, rank: ProcessRank):
+    """Open the store; the first process makes it, the others open it then."""
     from wholearm_jax.files.check_store import open_store
 
-    store = open_store(out, wanted, job.rows) if place.first else None
-    place.meet("store")
-    return store if store is not None else open_store(out, wanted, job.rows)
+    store = open_store(out, metadata, job.schedule_rows) if rank.is_first else None
+    rank.wait_for_others("store")
+    return store if store is not None else open_store(out, metadata, job.schedule_rows)
 
 
-def _fill(store, job: _Job, place: _Place) -> None:
-    """Compute and write the chunks that are missing and fall to this process."""
+def _fill(store, job: _Job, rank: ProcessRank) -> None:
+    """Compute and write the missing chunks of this process."""
     done = store.done()
-    missing = [k for k in range(place.number, store.chunks, place.count) if not done[k]]
+    missing = [k for k in range(rank.number, store.chunks, rank.count) if not done[k]]
     if not missing:
         return
-    with counting_progress("{task.fields[rate]}") as progress:
+    with count_progress("{task.fields[rate]}") as progress:
         total = sum(min(store.chunk, store.count - k * store.chunk) for k in missing)
         bar, begun, written = progress.add_task("scenes", total=total, rate="compiling"), None, 0
-        for number, values in _optimised(job, missing) if job.optimise else _checked(job, missing):
+        for number, values in _optimise_chunks(job, missing) if job.optimise else _check_chunks(job, missing):
             store.write(number, values)
             size = len(values["status"])
             written += size if begun is not None else 0  # the first chunk's time is that of compiling
@@ -224,7 +173,8 @@ def _fill(store, job: _Job, place: _Place) -> None:
             progress.update(bar, advance=size, rate=f"{rate:.0f}/s" if written else "")
 
 
-def _checked(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
+def _check_chunks(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
+    """Check the scenes of each missing chunk: yield its number and columns."""
     from wholearm_jax.ensembles import check_in_chunks
 
     settings = {"tolerance": job.settings["tolerance"], "arrival": job.settings["arrival"]}
@@ -233,8 +183,8 @@ def _checked(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
         yield number, part._asdict()
 
 
-def _optimised(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
-    """Optimise every scene of each chunk, one scene a processor."""
+def _optimise_chunks(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
+    """Optimise the scenes of each missing chunk, one scene a processor: yield its number and columns."""
     from concurrent.futures import ThreadPoolExecutor
 
     import jax
@@ -243,7 +193,7 @@ def _optimised(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
     from wholearm_jax.ensembles import BatchResult, from_result
     from wholearm_jax.optimisation import optimise
 
-    def one(number):
+    def optimise_scene(number):
         found = optimise(job.source.draw(number), knots=job.knots)
         schedule = np.column_stack([np.asarray(found.torque.times), np.asarray(found.torque.values)])
         return from_result(found.result), schedule
@@ -251,13 +201,13 @@ def _optimised(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
     with ThreadPoolExecutor(len(jax.local_devices())) as pool:
         for number in missing:
             rows = range(number * job.chunk, min(job.count, (number + 1) * job.chunk))
-            results, schedules = zip(*pool.map(one, rows), strict=True)
+            results, schedules = zip(*pool.map(optimise_scene, rows), strict=True)
             columns = [np.stack([np.asarray(value) for value in column]) for column in zip(*results, strict=True)]
             yield number, {**BatchResult(*columns)._asdict(), "torque": np.stack(schedules)}
 
 
-def _report(store, scene, source, out: Path):
-    """What became of all scenes, beside the store: `NAME.json`, and figures."""
+def _summarise(store, scene, source, out: Path):
+    """Summarise the store, and write the summary beside it: `NAME.json`, and figures."""
     import json
 
     import jax
@@ -265,17 +215,17 @@ def _report(store, scene, source, out: Path):
 
     from wholearm_jax.core import write_atomically
     from wholearm_jax.ensembles import Ensemble, most_influential, rank_correlations, summarise
-    from wholearm_jax.plotting import draw_ensemble, save_figure
+    from wholearm_jax.plotting import plot_ensemble, save_figure
 
-    told = summarise(scene, (store.read(k) for k in range(store.chunks)), store.count)
-    shown, more = (), {}
+    summary = summarise(scene, (store.read(k) for k in range(store.chunks)), store.count)
+    mapped, more = (), {}
     if isinstance(source, Ensemble) and source.parameters:
-        shifts = np.asarray(jax.lax.map(source.draw_offsets, told.numbers, batch_size=1024))
-        influence = rank_correlations(told.margins, shifts)
-        shown = tuple((source.parameters[k], shifts[:, k]) for k in most_influential(source.parameters, influence))
+        offsets = np.asarray(jax.lax.map(source.draw_offsets, summary.numbers, batch_size=1024))
+        influence = rank_correlations(summary.margins, offsets)
+        mapped = tuple((source.parameters[k], offsets[:, k]) for k in most_influential(source.parameters, influence))
         pairs = zip(source.parameters, influence.tolist(), strict=True)
         more = {"influence": {name: rank for name, rank in pairs if rank}}
-    with writing(str(out)):
-        write_atomically(out.with_suffix(".json"), json.dumps(told.as_dict() | more, indent=1) + "\n")
-        save_figure(lambda: draw_ensemble(told, more.get("influence"), shown), out.parent, out.stem)
-    return told
+    with refuse_unwritable(str(out)):
+        write_atomically(out.with_suffix(".json"), json.dumps(summary.as_dict() | more, indent=1) + "\n")
+        save_figure(lambda: plot_ensemble(summary, more.get("influence"), mapped), out.parent, out.stem)
+    return summary

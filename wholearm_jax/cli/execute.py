@@ -1,9 +1,7 @@
-"""`wholearm execute`: a schedule on free bodies with soft contacts."""
+"""`wholearm execute`: a torque schedule on free bodies with soft contacts."""
 
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -13,13 +11,12 @@ from wholearm_jax.cli.arguments import (
     BadInput,
     SceneName,
     TorqueFile,
-    counting_progress,
     load_scene,
     make_output_folder,
-    simulate_prediction,
-    traced_or_refused,
-    writing,
+    refuse_unwritable,
 )
+from wholearm_jax.cli.prediction import simulate_or_exit, trace_or_exit
+from wholearm_jax.cli.progress import count_progress
 
 
 def execute(
@@ -40,99 +37,100 @@ def execute(
     """Execute a torque schedule open loop on free bodies with soft contacts, in MuJoCo."""
     if video and out is None:
         raise BadInput("--video: needs a folder to write to: add --out DIR")
-    shares = _share("--friction", friction), _share("--mass", mass)
-    loaded = load_scene(scene, None)
+    fractions = _fraction("--friction", friction), _fraction("--mass", mass)
+    loaded = load_scene(scene)
     try:
         from wholearm_jax.execution import Amounts, ExecutionOutcome, Tolerance, require_objects, require_wires
-        from wholearm_jax.execution import execute as drive
-        from wholearm_jax.execution import run_trials as drive_perturbed
+        from wholearm_jax.execution import execute as rollout
     except ModuleNotFoundError as error:
         if error.name not in ("mujoco", "joblib"):
             raise
         raise BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
     from wholearm_jax.files import read_torque
 
-    schedule, amounts = read_torque(torque), Amounts(*shares, geometry, start)
+    schedule, amounts = read_torque(torque), Amounts(*fractions, geometry, start)
     if perturb:
         try:
             require_objects(loaded, amounts)
         except ValueError as error:
             raise BadInput(f"--{error}") from None
     folder = make_output_folder(out)
-    prediction = simulate_prediction(loaded, schedule, torque, 1e-10, traced_or_refused(scene, loaded))
-    within = Tolerance(position, angle)
+    prediction = simulate_or_exit(loaded, schedule, torque, 1e-10, trace_or_exit(scene, loaded))
     print(f"predicted: {prediction.message}")
     try:
         require_wires(prediction)
     except ValueError:
-        sys.exit(1)  # no wire, no end to arrive at; the line above says why
-    done = drive(prediction, timestep=timestep, tolerance=within)
-    for contact, made, expected, executed in done.events:
+        sys.exit(1)  # without a path there is no end to arrive at; the line above says why
+    settings = {"timestep": timestep, "tolerance": Tolerance(position, angle)}
+    execution = rollout(prediction, **settings)
+    _print_events(execution)
+    trials = _run_trials(prediction, perturb, amounts, seed=seed, **settings) if perturb else None
+    if folder is not None:
+        _write_execution(execution, trials, torque, folder, video)
+    print(f"executed: {execution.message}" + (f" -> {folder}" if folder else ""))
+    sys.exit(0 if execution.ending is ExecutionOutcome.OK else 1)
+
+
+def _fraction(option: str, text: str) -> float:
+    """Read `10%` or `0.1` as 0.1."""
+    try:
+        fraction = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError:
+        fraction = -1.0
+    if not 0 <= fraction < 1:
+        raise BadInput(f"{option} {text}: write a share between 0 and 1, e.g. 10% or 0.1")
+    return fraction
+
+
+def _print_events(execution) -> None:
+    """Print when each contact was made or opened, predicted and executed."""
+    for contact, made, expected, executed in execution.events:
         times = " predicted, ".join("never" if t is None else f"{t:.4f} s" for t in (expected, executed))
         print(f"{contact} {'made' if made else 'opened'}: {times} executed")
-    many = None
-    if perturb:
-        with _progress(perturb) as told:
-            settings = {"seed": seed, "timestep": timestep, "tolerance": within, "callback": told}
-            many = drive_perturbed(prediction, perturb, amounts, **settings)
-        print(many.message)
-    if folder is not None:
-        _write_execution(done, many, torque, folder, video)
-    print(f"executed: {done.message}" + (f" -> {folder}" if folder else ""))
-    sys.exit(0 if done.ending is ExecutionOutcome.OK else 1)
 
 
-def _share(option: str, text: str) -> float:
-    """`10%` or `0.1` -> 0.1."""
-    try:
-        share = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
-    except ValueError:
-        share = -1.0
-    if not 0 <= share < 1:
-        raise BadInput(f"{option} {text}: write a share between 0 and 1, e.g. 10% or 0.1")
-    return share
+def _run_trials(prediction, count: int, amounts, **settings):
+    """Execute perturbed objects with a progress bar, and print how many succeed."""
+    from wholearm_jax.execution import ExecutionOutcome, run_trials
 
-
-@contextmanager
-def _progress(count: int) -> Iterator[Callable]:
-    """A bar on the terminal while perturbed executions run, to be called with each that is done."""
-    from wholearm_jax.execution import ExecutionOutcome
-
-    with counting_progress("{task.fields[succeed]} succeed") as progress:
+    with count_progress("{task.fields[succeed]} succeed") as progress:
         bar, succeed = progress.add_task("perturbed executions", total=count, succeed=0), 0
 
-        def told(run) -> None:
+        def show(trial) -> None:
             nonlocal succeed
-            succeed += run.ending is ExecutionOutcome.OK
+            succeed += trial.ending is ExecutionOutcome.OK
             progress.update(bar, advance=1, succeed=succeed)
 
-        yield told
+        trials = run_trials(prediction, count, amounts, callback=show, **settings)
+    print(trials.message)
+    return trials
 
 
-def _write_execution(done, many, torque: Path, folder: Path, video: bool) -> None:
+def _write_execution(execution, trials, torque: Path, folder: Path, video: bool) -> None:
     """Write an execution's files."""
     from wholearm_jax.core import write_atomically
     from wholearm_jax.files import discard_execution, execution_summary, write_execution, write_summary
 
-    with writing(f"--out {folder}"):
+    with refuse_unwritable(f"--out {folder}"):
         discard_execution(folder)
-        write_summary(execution_summary(done, many, torque=str(torque)), folder / "execution.json")
-        write_execution(done, folder / "execution.csv")
-        write_atomically(folder / "model.xml", done.model_xml)
-        _draw_execution(done, folder, video)
+        write_summary(execution_summary(execution, trials, torque=str(torque)), folder / "execution.json")
+        write_execution(execution, folder / "execution.csv")
+        write_atomically(folder / "model.xml", execution.model_xml)
+        _write_figures(execution, folder, video)
 
 
-def _draw_execution(done, folder: Path, video: bool) -> None:
+def _write_figures(execution, folder: Path, video: bool) -> None:
+    """Write the figure of an execution and, with `video`, its strip of poses and animation."""
     import matplotlib.pyplot as plt
 
     from wholearm_jax.core import write_atomically
-    from wholearm_jax.plotting import animate, draw_execution, draw_execution_strip, save_figure
+    from wholearm_jax.plotting import animate, plot_execution, plot_execution_strip, save_figure
 
-    save_figure(lambda: draw_execution(done), folder, "execution")
+    save_figure(lambda: plot_execution(execution), folder, "execution")
     if video:
-        save_figure(lambda: draw_execution_strip(done), folder, "frames")
-        with tempfile.TemporaryDirectory() as elsewhere:
-            drawn = Path(elsewhere, "execution.gif")
-            animate(done).save(drawn, writer="pillow")  # which needs no further program
-            write_atomically(folder / "execution.gif", drawn.read_bytes())
+        save_figure(lambda: plot_execution_strip(execution), folder, "frames")
+        with tempfile.TemporaryDirectory() as scratch:
+            path = Path(scratch, "execution.gif")
+            animate(execution).save(path, writer="pillow")  # pillow needs no further program
+            write_atomically(folder / "execution.gif", path.read_bytes())
         plt.close("all")

@@ -16,8 +16,8 @@ from wholearm_jax.ensembles.summary import (
 
 __all__ = [
     "BLOCK",
-    "COARSE_PASS",
     "BatchResult",
+    "COARSE_PASS",
     "Ensemble",
     "EnsembleSummary",
     "SceneBatch",

@@ -1,6 +1,6 @@
 """TOML scenes, CSV and JSON results, NPZ polygons, and the Zarr store of checks."""
 
-from wholearm_jax.files.polygons_npz import how_many, read_polygons
+from wholearm_jax.files.polygons_npz import count_polygons, read_polygons
 from wholearm_jax.files.results import (
     TRAJECTORY_COLUMNS,
     discard,
@@ -25,15 +25,15 @@ from wholearm_jax.files.scene_toml import (
 )
 
 __all__ = [
-    "TRAJECTORY_COLUMNS",
     "Positive",
     "SceneError",
+    "TRAJECTORY_COLUMNS",
     "bundled",
+    "count_polygons",
     "discard",
     "discard_execution",
     "execution_summary",
     "explain_validation_error",
-    "how_many",
     "load",
     "parse",
     "read_polygons",

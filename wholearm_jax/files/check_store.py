@@ -2,7 +2,7 @@
 
 A chunk of every array is one file, written whole by one process; the chunk's entry in `done` is written last. Whoever
 is stopped, at any moment, leaves a store that can be read, and whoever opens it again goes on with the chunks that are
-not done. The store says what it is of (`identity`): another scene, schedule, seed, setting or version is refused.
+not done. The store says what it is of (`store_metadata`): another scene, schedule, seed, setting or version is refused.
 """
 
 import hashlib
@@ -80,7 +80,7 @@ class Store:
         return BatchResult(*(np.asarray(self.array(name)[self.rows(number)]) for name in BatchResult._fields))
 
 
-def identity(count: int, chunk: int, **settings: Any) -> dict[str, Any]:
+def store_metadata(count: int, chunk: int, **settings: Any) -> dict[str, Any]:
     """What a store is of: numbers and settings that JSON can hold, and the package's version."""
     whole = {"kind": KIND, "version": version("wholearm_jax"), "jax": version("jax"), "count": count, "chunk": chunk}
     return json.loads(json.dumps(whole | settings))
@@ -91,12 +91,12 @@ def open_store(path: Path, wanted: Mapping[str, Any], torques: int = 0) -> Store
     try:
         group = zarr.open_group(str(path), mode="r+")
     except (FileNotFoundError, GroupNotFoundError):
-        return _made(path, wanted, torques)
+        return _create_store(path, wanted, torques)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path}: not a store: {error}") from None
     held = dict(group.attrs).get("identity")
     if held is None and not group.attrs and {*group.keys()} <= {*TYPES, "torque", "done"}:
-        return _made(path, wanted, torques, again=True)
+        return _create_store(path, wanted, torques, again=True)
     if not isinstance(held, Mapping) or held.get("kind") != KIND:
         raise StoreError(f"{path}: holds something else than a check")
     other = sorted(key for key in {*held, *wanted} if held.get(key) != wanted.get(key))
@@ -105,7 +105,7 @@ def open_store(path: Path, wanted: Mapping[str, Any], torques: int = 0) -> Store
     return Store(path, group, int(wanted["count"]), int(wanted["chunk"]))
 
 
-def _made(path: Path, wanted: Mapping[str, Any], torques: int, again: bool = False) -> Store:
+def _create_store(path: Path, wanted: Mapping[str, Any], torques: int, again: bool = False) -> Store:
     """A new store. What it is of is written last, so that one that was left half made is made `again`."""
     if not again and path.exists() and (not path.is_dir() or any(p.suffix != ".partial" for p in path.iterdir())):
         raise StoreError(f"{path}: exists and is not a store")
@@ -114,17 +114,17 @@ def _made(path: Path, wanted: Mapping[str, Any], torques: int, again: bool = Fal
         group = zarr.create_group(str(path), overwrite=True)
         for name, kind in TYPES.items():
             fill = np.nan if kind == "float64" else -1
-            _add(group, name, kind, fill, (count, 5) if name == "end" else (count,), chunk)
+            _add_array(group, name, kind, fill, (count, 5) if name == "end" else (count,), chunk)
         if torques:
-            _add(group, "torque", "float64", np.nan, (count, torques, 3), chunk)
-        _add(group, "done", "uint8", 0, (-(-count // chunk),), 1)
+            _add_array(group, "torque", "float64", np.nan, (count, torques, 3), chunk)
+        _add_array(group, "done", "uint8", 0, (-(-count // chunk),), 1)
         group.attrs["identity"] = dict(wanted)
     except OSError as error:
         raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from None
     return Store(path, group, count, chunk)
 
 
-def _add(group: zarr.Group, name: str, kind: str, fill, shape: tuple[int, ...], chunk: int) -> None:
+def _add_array(group: zarr.Group, name: str, kind: str, fill, shape: tuple[int, ...], chunk: int) -> None:
     """An array cut into chunks along its first axis."""
     chunks = (min(chunk, shape[0]), *shape[1:])
     group.create_array(name, shape=shape, chunks=chunks, dtype=kind, fill_value=fill)

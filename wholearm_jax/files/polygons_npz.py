@@ -19,7 +19,7 @@ from wholearm_jax.model import Polygon, Scene, find_defect
 _UNREADABLE = (OSError, ValueError, KeyError, AttributeError, TypeError, EOFError, BadZipFile, ZlibError)
 
 
-def how_many(path: Path) -> int:
+def count_polygons(path: Path) -> int:
     """How many polygons a file has; 0 where it is none, of which `read_polygons` tells more."""
     try:
         with np.load(path, allow_pickle=False) as file:

@@ -17,7 +17,7 @@ from wholearm_jax.plotting.plan_figures import INK
 _HOLDS, _FATES = "#009E73", ("#D55E00", "#E69F00", "#56B4E9", "#CC79A7", "#8B6914", "#999999")  # of scenes in a survey
 
 
-def draw_ensemble(
+def plot_ensemble(
     told: EnsembleSummary,
     influence: dict[str, float] | None = None,
     parameters: Sequence[tuple[str, np.ndarray]] = (),

@@ -16,13 +16,13 @@ from matplotlib.patches import Polygon as Patch
 from wholearm_jax.model import feature_pair, rigid_body
 from wholearm_jax.plotting.palette import CONTACT_COLOURS, contact_styles
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
-from wholearm_jax.plotting.plan_figures import INK, PAGE, PALE, draw_pose, outline_at, over_time, pose_grid
+from wholearm_jax.plotting.plan_figures import INK, PAGE, PALE, outline_at, over_time, plot_pose, pose_grid
 
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
     from wholearm_jax.execution import Execution
 
 
-def draw_execution(execution: Execution, axes=None) -> np.ndarray:
+def plot_execution(execution: Execution, axes=None) -> np.ndarray:
     """An execution on top of its prediction: contact forces, deviation of the object, and which contacts touch.
 
     Takes and returns three axes.
@@ -31,15 +31,15 @@ def draw_execution(execution: Execution, axes=None) -> np.ndarray:
         ratios = (3, 1.2, 0.22 * len(execution.planned) + 0.3)
         size = (PAGE, 6.0)
         _, axes = plt.subplots(3, 1, figsize=size, sharex=True, layout="constrained", height_ratios=ratios)
-    draw_execution_forces(execution, axes[0])
-    draw_deviation(execution, axes[1])
-    draw_touch(execution, axes[2])
+    plot_execution_forces(execution, axes[0])
+    plot_deviation(execution, axes[1])
+    plot_touching(execution, axes[2])
     for ax in axes[:2]:
         ax.set_xlabel("")
     return np.asarray(axes)
 
 
-def draw_execution_strip(execution: Execution, poses: int = 8, axes=None) -> np.ndarray:
+def plot_execution_strip(execution: Execution, poses: int = 8, axes=None) -> np.ndarray:
     """An execution as a strip of poses, the predicted object dashed; takes and returns an array of axes."""
     axes = pose_grid(axes, 2, (poses + 1) // 2, 0.95)
     shown = np.linspace(0, len(execution.course.time) - 1, axes.size).round().astype(int)
@@ -72,7 +72,7 @@ def animate(execution: Execution, frames_per_second: int = 25, ax: Axes | None =
 def _draw_moment(execution: Execution, row: int, ax: Axes) -> None:
     """The executed pose of one step, and the predicted object's outline."""
     time = execution.course.time[row]
-    draw_pose(execution.prediction.scene, execution.course.z[row], ax, label=f"$t$ = {time:.2f} s")
+    plot_pose(execution.prediction.scene, execution.course.z[row], ax, label=f"$t$ = {time:.2f} s")
     expected = execution.expected
     if time <= expected.time[-1] + 1e-9:
         z = expected.z[min(np.searchsorted(expected.time, time - 1e-9), len(expected.time) - 1)]
@@ -80,7 +80,7 @@ def _draw_moment(execution: Execution, row: int, ax: Axes) -> None:
         ax.add_patch(Patch(outline, closed=True, fill=False, edgecolor=COLOURS[1], lw=0.8, ls="--", zorder=4))
 
 
-def draw_execution_forces(execution: Execution, ax: Axes | None = None) -> Axes:
+def plot_execution_forces(execution: Execution, ax: Axes | None = None) -> Axes:
     """Executed contact forces [N] over time, thin, on those that were predicted, pale and wide."""
     ax = ax or plt.gca()
     expected = execution.expected
@@ -100,7 +100,7 @@ def draw_execution_forces(execution: Execution, ax: Axes | None = None) -> Axes:
     return _legend_beside(ax)
 
 
-def draw_deviation(execution: Execution, ax: Axes | None = None) -> Axes:
+def plot_deviation(execution: Execution, ax: Axes | None = None) -> Axes:
     """How far the executed object is from the predicted one over time [mm]: its centre, and its angle at its rim."""
     ax = ax or plt.gca()
     course, expected = execution.course, execution.expected
@@ -116,7 +116,7 @@ def draw_deviation(execution: Execution, ax: Axes | None = None) -> Axes:
     return _legend_beside(ax)
 
 
-def draw_touch(execution: Execution, ax: Axes | None = None) -> Axes:
+def plot_touching(execution: Execution, ax: Axes | None = None) -> Axes:
     """A pale bar while a contact is predicted to touch, and a full one within it while it does."""
     ax = ax or plt.gca()
     shown = [n for n in execution.names if n in execution.planned or _touches(execution, n)]

@@ -52,7 +52,7 @@ Figures are then `COLUMN` or `PAGE` inches wide, with letters of 7 and 8 points.
 INK, _FILL, PALE = "#222222", "#E8EEF4", "#999999"
 
 
-def draw_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbers: bool = False) -> Axes:
+def plot_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbers: bool = False) -> Axes:
     """Hand and object at configuration `z`; `numbers` writes the vertices' numbers."""
     ax = ax or plt.gca()
     z = np.asarray(z)
@@ -78,7 +78,7 @@ def draw_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbe
     return ax
 
 
-def draw_successors(scene: Scene, z, ways, columns: int = 4, axes=None) -> np.ndarray:
+def plot_successors(scene: Scene, z, ways, columns: int = 4, axes=None) -> np.ndarray:
     """Where each way from configuration `z` leads: its end, with the start in grey; ways that can be traced only.
 
     Takes and returns an array of axes, at least one a way shown.
@@ -91,7 +91,7 @@ def draw_successors(scene: Scene, z, ways, columns: int = 4, axes=None) -> np.nd
         _ghost(scene, z, ax)
         held = f"static {way.static:.2f} N" if np.isfinite(way.static) else "cannot be held"
         label = f"{' '.join(way.contacts[:2])}\n{' '.join(way.contacts[2:])}\n{way.toward}: {way.ends}\n{held}"
-        draw_pose(scene, way.end, ax, label=label)
+        plot_pose(scene, way.end, ax, label=label)
         ax.title.set_fontsize("x-small")
     return axes
 
@@ -117,7 +117,7 @@ def outline_at(scene: Scene, z) -> np.ndarray:
     return corners @ np.array([[c, s], [-s, c]]) + z[:2]
 
 
-def draw_strip(result: Result, poses: int = 4, axes=None) -> np.ndarray:
+def plot_strip(result: Result, poses: int = 4, axes=None) -> np.ndarray:
     """The plan as strips of poses (as the paper's figs. 2 and 3): one row a phase, time running to the right.
 
     Takes and returns a `(phases, poses)` array of axes.
@@ -128,17 +128,17 @@ def draw_strip(result: Result, poses: int = 4, axes=None) -> np.ndarray:
         shown = np.linspace(0, len(course.time) - 1, axes.shape[1]).round().astype(int)
         for column, (ax, k) in enumerate(zip(axes[row], shown, strict=True)):
             label = f"$t$ = {float(course.time[k]):.2f} s"
-            draw_pose(result.scene, course.z[k], ax, label=label, numbers=row == 0 and column == 0)
+            plot_pose(result.scene, course.z[k], ax, label=label, numbers=row == 0 and column == 0)
         at = {"transform": axes[row, 0].transAxes, "rotation": 90, "va": "center", "ha": "right"}
         axes[row, 0].text(-0.04, 0.5, phase.name, style="italic", color=INK, **at)
     if not courses:
-        draw_pose(result.scene, result.scene.start, axes[0, 0], label=result.status.label)
+        plot_pose(result.scene, result.scene.start, axes[0, 0], label=result.status.label)
         for ax in axes[0, 1:]:
             ax.axis("off")
     return axes
 
 
-def draw_torques(result: Result, ax: Axes | None = None, *, legend: bool = True) -> Axes:
+def plot_torques(result: Result, ax: Axes | None = None, *, legend: bool = True) -> Axes:
     """Joint torques [N m] over time [s] (as the paper's fig. 6), and their limits, dotted."""
     ax = ax or plt.gca()
     times, values = np.asarray(result.torque.times), np.asarray(result.torque.values)
@@ -152,7 +152,7 @@ def draw_torques(result: Result, ax: Axes | None = None, *, legend: bool = True)
     return _legend(ax, 2) if legend else ax
 
 
-def draw_forces(result: Result, ax: Axes | None = None, *, legend: bool = True) -> Axes:
+def plot_forces(result: Result, ax: Axes | None = None, *, legend: bool = True) -> Axes:
     """Normal contact forces [N] over time [s], with the margin and its moment marked; for contacts that roll also how
     far inside its friction cone the force is, dotted."""
     ax = ax or plt.gca()
@@ -209,19 +209,19 @@ def _mark_margin(result: Result, ax: Axes) -> None:
     )
 
 
-def draw_result(result: Result, axes=None) -> np.ndarray:
+def plot_result(result: Result, axes=None) -> np.ndarray:
     """Torques above forces on one time axis; takes and returns two axes."""
     if axes is None:
         _, axes = plt.subplots(2, 1, figsize=(COLUMN, 3.9), sharex=True, layout="constrained", height_ratios=(2, 3))
-    draw_torques(result, axes[0], legend=False).set_xlabel("")
-    draw_forces(result, axes[1]).set_title("")
+    plot_torques(result, axes[0], legend=False).set_xlabel("")
+    plot_forces(result, axes[1]).set_title("")
     _legend(axes[0], 2)
     for words in axes[1].texts:
         words.set_visible(words.get_style() != "italic")  # the phases' names stand above the torques
     return axes
 
 
-def draw_history(found: OptimisationResult, ax: Axes | None = None) -> Axes:
+def plot_history(found: OptimisationResult, ax: Axes | None = None) -> Axes:
     """The least force [N] over the steps of the descent, a curve for each start of each phase, and the bounds."""
     ax = ax or plt.gca()
     for phase in range(len(found.bounds)):

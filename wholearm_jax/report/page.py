@@ -75,7 +75,7 @@ class _Summary(BaseModel):
     scene: dict[str, Any]
 
 
-class Written(NamedTuple):
+class ResultFolder(NamedTuple):
     """A result as its folder holds it: the summary, its scene, the schedule, and `name -> rows (time, numbers)`."""
 
     summary: dict[str, Any]
@@ -87,13 +87,13 @@ class Written(NamedTuple):
 def report(folder: str | Path) -> str:
     """The report of a result folder as one HTML page.
 
-    Reads `summary.json`, `trajectory.csv` and `torque_schedule.csv`. Raises `SceneError` naming the file and what is
+    Reads `summary.json`, `trajectory.csv` and `torque.csv`. Raises `SceneError` naming the file and what is
     wrong.
     """
-    return render(read_result(folder))
+    return render(load_result_folder(folder))
 
 
-def read_result(folder: str | Path) -> Written:
+def load_result_folder(folder: str | Path) -> ResultFolder:
     """Read a result folder. Raises `SceneError` naming the file and what is wrong with it."""
     folder = Path(folder)
     if not folder.is_dir():
@@ -104,10 +104,10 @@ def read_result(folder: str | Path) -> Written:
     if names != [phase.name for phase in scene.phases]:
         raise SceneError(f"{folder / 'summary.json'}: phases are not those of its scene")
     courses = _read_trajectory(folder / "trajectory.csv", names)
-    return Written(content, scene, read_torque(folder / "torque.csv"), courses)
+    return ResultFolder(content, scene, read_torque(folder / "torque.csv"), courses)
 
 
-def render(written: Written) -> str:
+def render(written: ResultFolder) -> str:
     """A result as one HTML page."""
     pages = Environment(loader=PackageLoader("wholearm_jax.report", "templates"), autoescape=True, trim_blocks=True)
     pages.filters |= {"digits": _digits}
@@ -122,11 +122,11 @@ def render(written: Written) -> str:
         colours=_colours(),
         moves=bool(written.courses),
         rolls=any(name.endswith(" rolling") for row in summary["phases"] for name in row["contacts"]),
-        data=_drawn(written),
+        data=_page_data(written),
     )
 
 
-def _drawn(written: Written) -> dict[str, Any]:
+def _page_data(written: ResultFolder) -> dict[str, Any]:
     """What the page draws, in SI units: the hand, the object about its centre of mass, and every phase sampled."""
     scene, hand, solid = written.scene, written.scene.hand, rigid_body(written.scene.object)
     styles = contact_styles(row["contacts"] for row in written.summary["phases"])
@@ -153,7 +153,7 @@ def _drawn(written: Written) -> dict[str, Any]:
                 "tau": _rounded(columns["tau"]),
                 "cn": _rounded(columns["cn"][:, :count]),
                 "ct": _rounded(columns["ct"][:, :count]),
-                "places": _rounded(_places(scene, phase.formation, columns["z"])),
+                "places": _rounded(_contact_positions(scene, phase.formation, columns["z"])),
             }
         )
     shown = {name: _rounded(np.asarray(getattr(hand, name))) for name in ("joint", "length", "offset", "torque_limit")}
@@ -178,7 +178,7 @@ def _until(torque: TorqueSchedule, end: float) -> dict[str, Any]:
     return {"t": _rounded([*times[before], end]), "tau": _rounded([*values[before], last])}
 
 
-def _places(scene: Scene, formation, z: np.ndarray) -> np.ndarray:
+def _contact_positions(scene: Scene, formation, z: np.ndarray) -> np.ndarray:
     """Where each contact is, and its normal into the object: `(samples, contacts, 4)`."""
     several = contact_set(rigid_body(scene.object), scene.hand, formation)
 

@@ -1,0 +1,133 @@
+"""`wholearm optimise`: the torques with the largest margin, for one scene or (`--robust`) for an ensemble."""
+
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from wholearm_jax.cli.arguments import (
+    ARRIVAL_FRACTION,
+    BadInput,
+    Changes,
+    OutputFolder,
+    SceneName,
+    load_scene,
+    make_output_folder,
+    parse_ensemble,
+)
+from wholearm_jax.cli.output import write_and_exit, write_result
+from wholearm_jax.cli.prediction import trace_or_exit
+from wholearm_jax.cli.progress import solver_progress
+
+
+def optimise(
+    scene: SceneName,
+    out: OutputFolder = None,
+    set_: Changes = None,
+    knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase.")] = 51,
+    steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 160,
+    rate_limit: Annotated[float | None, typer.Option(min=1e-9, help="Largest torque rate [N m/s].")] = None,
+    passing: Annotated[
+        float | None, typer.Option(min=0.0, help="Least speed at changes of formation, over the mean speed (0.2).")
+    ] = None,
+    samples: Annotated[
+        int | None, typer.Option(min=2, help="Rows a phase in trajectory.csv (201), or samples.")
+    ] = None,
+    robust: Annotated[
+        list[str] | None,
+        typer.Option(help="QUANTITY=AMOUNT: the best torques for --samples (64) varied scenes."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the varied scenes.")] = 0,
+    arrival: Annotated[float, typer.Option(min=1e-9, max=1.0, help="As of `check`, for --robust.")] = ARRIVAL_FRACTION,
+    report: Annotated[bool, typer.Option("--report", help="Also report.html, one page with an animation.")] = False,
+) -> None:
+    """Find the torques with the largest compressive margin, and check them by simulation."""
+    if report and out is None:
+        raise BadInput("--report: needs a folder to write to: add --out DIR")
+    loaded = load_scene(scene, set_)
+    folder = make_output_folder(out)
+    if robust:
+        others = (("rate-limit", rate_limit), ("passing", passing))
+        unknown = [name for name, value in others if value is not None]
+        if unknown:
+            raise BadInput(f"--robust: knows no --{unknown[0]}")
+        _optimise_ensemble(parse_ensemble(loaded, robust, seed), folder, samples or 64, knots, steps, arrival, report)
+    from wholearm_jax.optimisation import MIN_TRANSITION_SPEED
+
+    passing = MIN_TRANSITION_SPEED if passing is None else passing
+    options = {"knots": knots, "steps": steps, "rate_limit": rate_limit, "passing": passing}
+    begun = time.perf_counter()
+    found = _optimise_scene(scene, loaded, options)
+    more = {"command": "optimise", "knots": knots, "steps": len(found.history), "seconds": time.perf_counter() - begun}
+    more |= {"rate_limit": rate_limit, "passing": passing, "stopped": list(found.stopped)}
+    _print_optimised(found)
+    values = tuple(float(b.value) for b in found.bounds)
+    write_and_exit(found.result, folder, samples or 201, report=report, bounds=values, **more)
+
+
+def _optimise_scene(name: str, scene, options: dict):
+    """Trace and optimise one scene, with a progress bar for each phase."""
+    from wholearm_jax.optimisation import optimise as solve
+    from wholearm_jax.optimisation import precompile_optimise
+
+    precompile_optimise(scene, knots=options["knots"])
+    traced = trace_or_exit(name, scene)
+    with solver_progress() as progress:
+        bars = [progress.add_task(p.name, total=options["steps"], state="waiting") for p in scene.phases]
+
+        def show(step):
+            state = f"margin {step.margin:.4f} N, apart {step.apart:.0e}"
+            progress.update(bars[step.phase], completed=step.step + 1, state=state)
+
+        progress.update(bars[0], state="compiling")
+        found = solve(scene, **options, callback=show, traced=traced)
+        for bar, reason in zip(bars, found.stopped, strict=True):
+            progress.update(bar, completed=options["steps"], state=reason)
+    return found
+
+
+def _print_optimised(found) -> None:
+    """Print a line for each phase: its message, its bound, the fraction of it that was reached, why the solver stopped."""
+    for phase, bound, fraction, reason in zip(
+        found.result.phases, found.bounds, found.bound_fraction, found.stopped, strict=True
+    ):
+        ok = phase.status.value == 0 and 0 < fraction < float("inf")  # a failed plan may not come to the hard part
+        reached = f", {100 * fraction:.1f} % of it reached" if ok else ""
+        print(f"{phase.message}; bound {float(bound.value):.4g} N{reached}; stopped: {reason}")
+
+
+def _optimise_ensemble(
+    ensemble, folder: Path | None, samples: int, knots: int, steps: int, arrival: float, report: bool
+) -> None:
+    """Optimise for an ensemble, print the scores, write the nominal scene's result, and exit."""
+    from wholearm_jax.ensembles import optimise_robustly
+    from wholearm_jax.optimisation import bounds
+    from wholearm_jax.phases import require_motion, simulate
+
+    try:
+        require_motion(ensemble.scene)
+    except ValueError as error:
+        raise BadInput(f"--robust: {error}") from None
+    with solver_progress() as progress:
+        bar = progress.add_task("robust", total=steps + 1, state="the nominal schedule")
+
+        def show(step, score):
+            state = f"{100 * score.success_rate:.0f} % hold, worst {score.margin:.4f} N"
+            progress.update(bar, completed=step + 1, state=state)
+
+        found = optimise_robustly(ensemble, samples=samples, knots=knots, steps=steps, arrival=arrival, callback=show)
+    for name, scores in (("sampled", found.in_sample), ("unseen", found.out_of_sample)):
+        nominal, robust = (f"{100 * s.success_rate:.1f} % hold, worst margin {s.margin:.4g} N" for s in scores)
+        print(f"{samples} {name} scenes: nominal {nominal}; robust {robust}")
+    result = simulate(ensemble.scene, found.torque, arrival=arrival)
+    nominal, robust = found.out_of_sample
+    more = {"command": "optimise --robust", "knots": knots, "steps": steps, "varied": samples, "arrival": arrival}
+    amounts = (f"{name}={100 * a.size:g}%" if a.relative else f"{name}={a.size:g}" for name, a in ensemble.spreads)
+    more |= {"robust": ", ".join(amounts), "seed": ensemble.seed}
+    more |= {"unseen_share": robust.success_rate, "unseen_margin": robust.margin}
+    more |= {"unseen_share_nominal": nominal.success_rate, "unseen_margin_nominal": nominal.margin}
+    values = tuple(float(b.value) for b in bounds(ensemble.scene))
+    write_result(result, folder, 201, report, bounds=values, **more)
+    sys.exit(0 if robust.success_rate == 1.0 else 1)
