@@ -89,7 +89,7 @@ def _optimise_scene(name: str, scene, options: dict):
 
 
 def _print_optimised(found) -> None:
-    """Print a line for each phase: its message, its bound, the fraction of it that was reached, why the solver stopped."""
+    """Print a line for each phase: message, bound, fraction of the bound reached, and why the solver stopped."""
     for phase, bound, fraction, reason in zip(
         found.result.phases, found.bounds, found.bound_fraction, found.stopped, strict=True
     ):

@@ -16,8 +16,8 @@ from wholearm_jax.ensembles.summary import (
 
 __all__ = [
     "BLOCK",
-    "BatchResult",
     "COARSE_PASS",
+    "BatchResult",
     "Ensemble",
     "EnsembleSummary",
     "SceneBatch",

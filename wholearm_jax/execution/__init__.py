@@ -22,8 +22,8 @@ from wholearm_jax.execution.trials import (
 )
 
 __all__ = [
-    "Amounts",
     "CONVEX",
+    "Amounts",
     "ContactCompliance",
     "Execution",
     "ExecutionOutcome",

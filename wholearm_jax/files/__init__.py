@@ -25,9 +25,9 @@ from wholearm_jax.files.scene_toml import (
 )
 
 __all__ = [
+    "TRAJECTORY_COLUMNS",
     "Positive",
     "SceneError",
-    "TRAJECTORY_COLUMNS",
     "bundled",
     "count_polygons",
     "discard",
