@@ -140,7 +140,7 @@ def test_pages_on_the_layout_name_every_folder():
 
 
 def test_files_that_documents_and_docstrings_cite_exist():
-    """`tests/...`, `benchmarks/...`, `docs/...` and `examples/...` in backticks, in pages and in the code."""
+    """`tests/...`, `benchmarks/...`, `docs/...` in backticks, in pages and in the code; modules as `folder/name.py`."""
     cited = {
         (path, name)
         for path in [*MODULES, *PAGES]
@@ -149,6 +149,14 @@ def test_files_that_documents_and_docstrings_cite_exist():
     }
     assert len(cited) >= 8
     assert [(str(path), name) for path, name in cited if not (ROOT / name).exists()] == []
+    package_folders = "|".join(FOLDERS)
+    modules = {
+        (path, name)
+        for path in PAGES
+        for name in re.findall(rf"`((?:{package_folders})/[\w/]+\.py)`", path.read_text())
+    }
+    assert len(modules) >= 8
+    assert [(str(path), name) for path, name in modules if not (PACKAGE / name).exists()] == []
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
