@@ -27,7 +27,7 @@ from wholearm_jax.simulation.integrator import IntegratorOptions
 from wholearm_jax.simulation.phase_motion import simulate_motion
 from wholearm_jax.tracing.events import EventValues, detect_events
 from wholearm_jax.tracing.path import Resolution
-from wholearm_jax.tracing.projection import _link_penetrates_object
+from wholearm_jax.tracing.start_checks import link_penetrates_object
 
 
 def scene(vertices, contacts, toward, start, *, joint, length, offset=(0.0, 0.0)):
@@ -363,7 +363,7 @@ def test_links_within_an_object_of_any_shape():
             links.append(root + 2 * share * [np.cos(theta), np.sin(theta)])
         expected = bool(outline.contains_points(np.concatenate(links)).any())
         pairs = contact_kinematics(near.candidates, jnp.asarray(z) / near.configuration_unit)
-        assert bool(_link_penetrates_object(near, pairs, 1e-10)) == expected
+        assert bool(link_penetrates_object(near, pairs, 1e-10)) == expected
         found.append(expected)
     assert 10 < sum(found) < 50
 

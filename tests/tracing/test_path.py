@@ -15,7 +15,8 @@ from wholearm_jax.model.mechanics import scaled_mechanics
 from wholearm_jax.model.scene import rigid_body
 from wholearm_jax.phases.phase_ends import describe_end
 from wholearm_jax.phases.phase_tracing import trace_phase
-from wholearm_jax.tracing.path import Resolution, _distribute_panels
+from wholearm_jax.tracing.path import Resolution
+from wholearm_jax.tracing.segments import distribute_panels
 
 ENDS = {
     "heptagon": ("finger2:v4 is made", "palm:v0 is made"),
@@ -248,7 +249,7 @@ def test_panels_go_where_the_wire_is_long(lengths, panels):
     """At least one to each piece that is used; what rounding leaves over goes to the longest."""
     segments, count = 4, len(lengths)
     breaks = jnp.pad(jnp.cumsum(jnp.asarray([0.0, *lengths])), (0, segments - count), mode="edge")
-    first, shared, owner = _distribute_panels(breaks, count, Resolution(segments, panels=4))
+    first, shared, owner = distribute_panels(breaks, count, Resolution(segments, panels=4))
     assert shared[:count].tolist() == panels
     assert shared[count:].tolist() == [0] * (segments - count)
     assert first[:count].tolist() == np.cumsum([0, *panels])[:-1].tolist()

@@ -4,6 +4,7 @@ from wholearm_jax.model.kinematics import (
     FEATURE_GROUPS,
     FINGER_ROOT,
     PALM_END,
+    ContactKinematics,
     ContactSet,
     anchor_rolling,
     constraint_jacobian,

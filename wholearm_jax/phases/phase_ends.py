@@ -9,7 +9,7 @@ from wholearm_jax.margin import RestAccelerations, Statics, contact_statics
 from wholearm_jax.model import FEATURE_GROUPS, FINGER_ROOT, PALM_END, Phase, Scene, contact_name
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.simulation import Motion
-from wholearm_jax.tracing import LEFT, MADE, UNTIL
+from wholearm_jax.tracing import PathEnd
 
 
 @jax.jit
@@ -51,7 +51,7 @@ def describe_end(traced: TracedPhase, phase: Phase, capacity: int) -> str:
     if phase.arrive == "hold":
         return "the object is held"
     reason, index = int(traced.path.end_reason), int(traced.path.end_contact)
-    if reason == MADE:
+    if reason == PathEnd.CONTACT_MADE:
         group, feature = divmod(index, capacity)
         link, kind = FEATURE_GROUPS[group]
         if kind == FINGER_ROOT:
@@ -59,6 +59,6 @@ def describe_end(traced: TracedPhase, phase: Phase, capacity: int) -> str:
         if kind == PALM_END:
             return f"e{feature} meets the palm's end at finger{link}"
         return f"{contact_name(link, kind, feature)} is made"
-    if reason == LEFT:
+    if reason == PathEnd.FEATURE_END:
         return f"{phase.formation.names[phase.formation.contact_of_row[index]]} leaves its feature"
-    return "the phase's own limit is reached" if reason == UNTIL else "no end was found"
+    return "the phase's own limit is reached" if reason == PathEnd.TARGET else "no end was found"

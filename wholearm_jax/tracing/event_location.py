@@ -1,4 +1,4 @@
-"""Places on a wire: its end and its kinks, each where something vanishes, and whether the wire meets another one.
+"""Location of a path's end and kinks to rounding level, and detection of bifurcations.
 
 Derivation: section 3 of `docs/derivation.md`.
 """
@@ -11,98 +11,118 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import eps_power, take_row
-from wholearm_jax.model import contact_kinematics, slip_velocity_at
-from wholearm_jax.tracing.continuation import BRACKET_STEP, TracedCurve, oriented_tangent
+from wholearm_jax.model import PathTarget, ScaledMechanics, contact_kinematics, slip_velocity_at
+from wholearm_jax.tracing.continuation import BRACKET_STEP
+from wholearm_jax.tracing.curve import TracedCurve, oriented_tangent, path_coordinate
 from wholearm_jax.tracing.path_root import solve_on_path
 
 
 class EventPoints(NamedTuple):
-    """The wire's end and its kinks in order, with their tangents `x`; `s` is infinite for unused rows."""
+    """A path's kinks in order along it, and its end."""
 
-    z: Float[Array, "places 5"]
-    x: Float[Array, "places 5"]
-    s: Float[Array, "places"]
-    chart: Int[Array, "places"]
-    end: Float[Array, "5"]
-    end_s: Float[Array, ""]
+    z: Float[Array, "kinks 5"]  # configuration
+    x: Float[Array, "kinks 5"]  # tangent dz/ds
+    s: Float[Array, "kinks"]  # path coordinate; infinite in unused rows
+    chart: Int[Array, "kinks"]  # chart of the segment before
+    end: Float[Array, "5"]  # configuration at the end
+    end_s: Float[Array, ""]  # path coordinate there
     has_bifurcation: Bool[Array, ""]
-    failed: Bool[Array, ""]
+    failed: Bool[Array, ""]  # a point was not located within its bracket
 
 
-_CHART_PLANE, _PATH_END = 6, 7  # what vanishes: 0-3 slip of a contact, 4-5 speed of a joint, then these
+class _EventGuesses(NamedTuple):
+    """Where to search for the events: the kinks, then the end."""
+
+    used: Bool[Array, "events"]
+    node: Int[Array, "events"]  # the node after the event
+    row: Int[Array, "events"]  # of `_event_residuals`
+    z: Float[Array, "events 5"]
+    chart: Int[Array, "events"]
 
 
-def locate_events(mechanics, target, curve: TracedCurve, most: int) -> EventPoints:
-    """Sharpen the bracketed end and every sign change of slips and joint speeds to rounding level: `most` places."""
-    fixed = stop_gradient(mechanics)
-    last = jnp.maximum(curve.n - 1, 0)
-    (found,) = jnp.nonzero(curve.nodes.sign_changed.ravel(), size=most - 1, fill_value=-1)
-    used = jnp.append(found >= 0, True)
-    march_step = jnp.append(jnp.where(found >= 0, found // 7, 0), last)
-    what = jnp.append(jnp.where(found >= 0, found % 7, _CHART_PLANE), _PATH_END)
-    fraction = curve.nodes.change_fraction[march_step, jnp.minimum(what, _CHART_PLANE)][:, None]
-    guess = curve.nodes.z[march_step - 1] * (1 - fraction) + curve.nodes.z[march_step] * fraction
-    guess = jnp.where(used[:, None], guess, curve.nodes.z[0]).at[-1].set(curve.end_z)
+_CHART_CHANGE, _PATH_END = 6, 7  # rows of `_event_residuals`; 0-3: slip of a contact, 4-5: speed of a joint
 
-    # A chart ends at the node before the first step in the next one.
-    chart = curve.nodes.chart[jnp.maximum(march_step - (what == _CHART_PLANE), 0)]
 
-    def locate(row):
-        used, march_step, what, guess, chart = row
-        hint = take_row(curve.nodes.x, jnp.maximum(march_step - 1, 0))
+def locate_events(mechanics: ScaledMechanics, target: PathTarget, curve: TracedCurve, max_events: int) -> EventPoints:
+    """Refine the bracketed end and every sign change of slips and joint speeds by Newton's method along the path."""
+    guesses = _event_guesses(curve, max_events)
 
-        def vanishing(mechanics, z, x, target):
-            return _event_residuals(mechanics, target, curve, z, x, hint @ (z - guess))[what]
+    def refine(guess: _EventGuesses):
+        hint = take_row(curve.nodes.x, jnp.maximum(guess.node - 1, 0))
 
-        def sharp():
-            root = solve_on_path(vanishing, mechanics, guess, hint, target)
-            return root.z, root.x, root.residual, path_coordinate(curve, chart, root.z)
+        def residual(mechanics, z, x, target):
+            return _event_residuals(mechanics, target, curve, z, x, hint @ (z - guess.z))[guess.row]
 
-        none = jnp.zeros_like(guess[0])
-        return jax.lax.cond(used, sharp, lambda: (guess, hint, none, none))
+        def solve():
+            root = solve_on_path(residual, mechanics, guess.z, hint, target)
+            return root.z, root.x, root.residual, path_coordinate(curve, guess.chart, root.z)
 
-    # One after the other: most wires have few.
-    z, x, residual, s = jax.lax.map(locate, (used, march_step, what, guess, chart))
-    slack = jnp.where(what == _PATH_END, 4 * BRACKET_STEP, eps_power(z, 3 / 8))
-    before = jnp.where(march_step > 0, curve.nodes.s[jnp.maximum(march_step - 1, 0)], 0.0)
-    unresolved = (residual > eps_power(z, 1 / 2)) | (s < before - slack) | (s > curve.nodes.s[march_step] + slack)
-    failed = jnp.any(used & unresolved)
-    kinks = jnp.where(used[:-1], s[:-1], jnp.inf)
+        none = jnp.zeros_like(guess.z[0])
+        return jax.lax.cond(guess.used, solve, lambda: (guess.z, hint, none, none))
+
+    # One after the other: most paths have few events.
+    z, x, residual, s = jax.lax.map(refine, guesses)
+    unresolved = _leaves_bracket(curve, guesses, s) | (residual > eps_power(z, 1 / 2))
+    kinks = jnp.where(guesses.used[:-1], s[:-1], jnp.inf)
     rank = jnp.argsort(stop_gradient(kinks))
-    branched = _has_bifurcation(fixed, curve, stop_gradient(z[-1]), unresolved[-1])
-    return EventPoints(z[rank], x[rank], kinks[rank], chart[rank], z[-1], s[-1], branched, failed)
+    return EventPoints(
+        z=z[rank],
+        x=x[rank],
+        s=kinks[rank],
+        chart=guesses.chart[rank],
+        end=z[-1],
+        end_s=s[-1],
+        has_bifurcation=_has_bifurcation(stop_gradient(mechanics), curve, stop_gradient(z[-1]), unresolved[-1]),
+        failed=jnp.any(guesses.used & unresolved),
+    )
 
 
-def _event_residuals(mechanics, target, curve, z, x, ahead_of_guess):
-    """What may fix a place on the wire by vanishing there: `reversal_functions`, the way from the guess, what ends the
-    wire."""
-    pairs, slots = mechanics.candidates.lower.shape[0], mechanics.contacts.lower.shape[0]
+def _event_guesses(curve: TracedCurve, max_events: int) -> _EventGuesses:
+    """Collect the sign changes between nodes, and the end, with linear estimates of where they are."""
+    last = jnp.maximum(curve.n - 1, 0)
+    (change,) = jnp.nonzero(curve.nodes.sign_changed.ravel(), size=max_events - 1, fill_value=-1)
+    used = jnp.append(change >= 0, True)
+    node = jnp.append(jnp.where(change >= 0, change // 7, 0), last)
+    row = jnp.append(jnp.where(change >= 0, change % 7, _CHART_CHANGE), _PATH_END)
+    fraction = curve.nodes.change_fraction[node, jnp.minimum(row, _CHART_CHANGE)][:, None]
+    z = curve.nodes.z[node - 1] * (1 - fraction) + curve.nodes.z[node] * fraction
+    z = jnp.where(used[:, None], z, curve.nodes.z[0]).at[-1].set(curve.end_z)
+    # A chart ends at the node before the first step in the next one.
+    chart = curve.nodes.chart[jnp.maximum(node - (row == _CHART_CHANGE), 0)]
+    return _EventGuesses(used, node, row, z, chart)
+
+
+def _leaves_bracket(curve: TracedCurve, guesses: _EventGuesses, s) -> Bool[Array, "events"]:
+    """Whether located events lie outside the steps in which they were detected."""
+    slack = jnp.where(guesses.row == _PATH_END, 4 * BRACKET_STEP, eps_power(s, 3 / 8))
+    before = jnp.where(guesses.node > 0, curve.nodes.s[jnp.maximum(guesses.node - 1, 0)], 0.0)
+    return (s < before - slack) | (s > curve.nodes.s[guesses.node] + slack)
+
+
+def _event_residuals(mechanics, target, curve, z, x, beyond_guess):
+    """Functions that vanish at events: `reversal_functions`, the distance `beyond_guess` along the path, and the
+    terminal event's function (the distance again where the path has no end)."""
+    pairs, rows = mechanics.candidates.lower.shape[0], mechanics.contacts.lower.shape[0]
     made = jnp.clip(curve.end, 0, pairs - 1)
     contacts = jax.tree.map(
         lambda a, b: jnp.append(a, take_row(b, made)[None], axis=0), mechanics.contacts, mechanics.candidates
     )
     at = contact_kinematics(contacts, z)
-    room = [(at.along - contacts.lower)[:slots], (contacts.upper - at.along)[:slots]]
-    ahead = target.until_value - take_row(z, jnp.maximum(target.until_coordinate, 0))
-    others = jnp.concatenate([*room, ahead[None]])
-    ending = jnp.where(curve.end < pairs, at.gap[slots], take_row(others, jnp.maximum(curve.end - pairs, 0)))
-    ending = jnp.where(curve.end < 0, ahead_of_guess, ending)
-    return jnp.concatenate([slip_velocity_at(contacts, at, x)[:slots], x[3:], jnp.stack([ahead_of_guess, ending])])
+    feature_distance = [(at.along - contacts.lower)[:rows], (contacts.upper - at.along)[:rows]]
+    target_distance = target.until_value - take_row(z, jnp.maximum(target.until_coordinate, 0))
+    distances = jnp.concatenate([*feature_distance, target_distance[None]])
+    terminal = jnp.where(curve.end < pairs, at.gap[rows], take_row(distances, jnp.maximum(curve.end - pairs, 0)))
+    terminal = jnp.where(curve.end < 0, beyond_guess, terminal)
+    return jnp.concatenate([slip_velocity_at(contacts, at, x)[:rows], x[3:], jnp.stack([beyond_guess, terminal])])
 
 
-def _has_bifurcation(mechanics, curve, end, failed):
-    """Whether the wire meets another one on its way: `det [G; x]` changes sign."""
+def _has_bifurcation(mechanics, curve: TracedCurve, end, end_unresolved) -> Bool[Array, ""]:
+    """Whether `det [G; x]` changes sign on the path."""
     rows, last = jnp.arange(curve.nodes.s.shape[0]), jnp.maximum(curve.n - 1, 0)
-    # The last node lies a little beyond the end: it counts only if the end was not found.
+    # The last node lies a little beyond the end: it counts only if the end was not located.
     _, at_end = oriented_tangent(mechanics, end, curve.nodes.x[jnp.maximum(last - 1, 0)])
-    along = jnp.where((rows == last) & ~failed, at_end, curve.nodes.orientation)
+    orientation = jnp.where((rows == last) & ~end_unresolved, at_end, curve.nodes.orientation)
     live = (rows < curve.n) & (rows > 0) & (curve.end >= 0)
-    size = jnp.abs(jnp.where(live, along, along[0])).max()
-    # Where two wires meet, Newton's method finds the end to half of the digits only.
-    return jnp.any(live & (along * jnp.sign(along[0]) < eps_power(end, 3 / 8) * size))
-
-
-def path_coordinate(curve: TracedCurve, chart, z):
-    """Where along the wire `z` is, by one of its charts."""
-    charts = curve.charts
-    return charts.anchor_s[chart] + charts.direction[chart] @ (z - charts.anchor[chart])
+    size = jnp.abs(jnp.where(live, orientation, orientation[0])).max()
+    # At a bifurcation Newton's method finds the end to half of the digits only.
+    return jnp.any(live & (orientation * jnp.sign(orientation[0]) < eps_power(end, 3 / 8) * size))
