@@ -68,11 +68,11 @@ def _gap_function(scene):
 def _note_unreached(name: str, scene, traced) -> None:
     """Note the phases that end before their `until`."""
     from wholearm_jax.model import COORDINATES
-    from wholearm_jax.tracing import UNTIL
+    from wholearm_jax.tracing import PathEnd
 
     for k, (phase, trace) in enumerate(zip(scene.phases, traced, strict=True)):
         row = int(phase.target.until_coordinate)
-        if row >= 0 and int(trace.dynamics.status) == 0 and int(trace.path.end_reason) != UNTIL:
+        if row >= 0 and int(trace.dynamics.status) == 0 and int(trace.path.end_reason) != PathEnd.TARGET:
             begin, end = (float(z[row]) for z in (trace.begin, trace.end))
             until = f"{COORDINATES[row]} = {float(phase.target.until_value):.6g}"
             note(f"{name}: phase[{k}].until: {until} is not on its wire, which leads from {begin:.6g} to {end:.6g}")
