@@ -11,7 +11,8 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.core import config as settings
-from wholearm_jax.optimisation.riccati import ParametricLQ, _backward_pass, _LQStages, _stage_layout
+from wholearm_jax.optimisation.lq_problem import LQStages, ParametricLQ, stage_layout
+from wholearm_jax.optimisation.riccati import _backward_pass
 
 LOOKING = """
 import jax
@@ -44,8 +45,8 @@ def test_a_loop_is_one_function():
 
 def test_the_recursion_over_knots_is_one_function():
     """Calls of libraries, as for products of matrices, would keep the loop about them in pieces."""
-    at = _stage_layout(1, 9)
-    stages = _LQStages(*(jnp.ones((1, 8, rows, at.size + 2)) for rows in (at.size + 2, 4, 2)))
+    at = stage_layout(1, 9)
+    stages = LQStages(*(jnp.ones((1, 8, rows, at.size + 2)) for rows in (at.size + 2, 4, 2)))
     quadratic = ParametricLQ(*(jnp.ones(()) for _ in ParametricLQ._fields))
     text = jax.jit(lambda stages: _backward_pass(at, stages, quadratic)).lower(stages).compile().as_text()
     assert text.count(" while(") == text.count('xla_cpu_small_call="true"') > 0

@@ -10,20 +10,19 @@ import wholearm_jax as wa
 from wholearm_jax.margin import quasistatic as squeeze
 from wholearm_jax.margin.contact_forces import dense_output, evaluate_dense
 from wholearm_jax.model.schedule import restrict_to_phase
-from wholearm_jax.optimisation.interior_point import retract
-from wholearm_jax.optimisation.linearisation import Limits
-from wholearm_jax.optimisation.multiple_shooting import Variables, interval_inputs, simulate_intervals
+from wholearm_jax.optimisation.multiple_shooting import simulate_intervals
+from wholearm_jax.optimisation.variables import Variables, interval_inputs
 from wholearm_jax.phases.plan_tracing import trace
 from wholearm_jax.simulation.integrator import IntegratorOptions
 from wholearm_jax.simulation.phase_motion import simulate_motion
 
-HOW = IntegratorOptions()
+OPTIONS = IntegratorOptions()
 
 
-def _shot(dynamics, intervals, q):
+def _simulate_one(dynamics, intervals, q):
     """One interval: its parts, and its end."""
-    shot = simulate_intervals(dynamics, HOW, intervals, q[None])
-    return shot.parts, shot.end[0]
+    results = simulate_intervals(dynamics, OPTIONS, intervals, q[None])
+    return results.parts, results.end[0]
 
 
 @pytest.fixture(scope="module")
@@ -34,18 +33,18 @@ def flip():
     return dynamics
 
 
-def _moving(dynamics):
+def _crossing(dynamics):
     """An interval that begins shortly before the reversal and crosses it."""
     reversal = float((dynamics.breakpoints[1] - dynamics.breakpoints[0]) / dynamics.length)
     return jnp.array([reversal - 1e-4, 0.1, 0.10443, -0.94068, 0.30118, -0.94629, 0.0]), reversal
 
 
 def test_an_interval_crosses_a_reversal_as_the_simulation_does(flip):
-    q, reversal = _moving(flip)
+    q, reversal = _crossing(flip)
     intervals = 300
-    parts, end = _shot(flip, intervals, q)
+    parts, end = _simulate_one(flip, intervals, q)
     assert float(end[0]) > reversal, "the interval must cross the reversal"
-    assert (np.asarray(parts.weight) > 0).sum() == 18, "two parts of one step with nine samples"
+    assert (np.asarray(parts.force_weight) > 0).sum() == 18, "two parts of one step with nine samples"
     values = q[2:6].reshape(2, 2) * flip.torque_limit
     duration = jnp.exp(q[6]) / intervals
     phase_schedule = restrict_to_phase(wa.torque_schedule([0.0, float(duration)], values), jnp.zeros(()), duration)
@@ -58,13 +57,13 @@ def test_an_interval_crosses_a_reversal_as_the_simulation_does(flip):
     np.testing.assert_allclose(end, [s_end, v_end], rtol=1e-9)
 
 
-def test_paces_bound_the_speed_between_knots(flip):
+def test_speed_coefficients_bound_the_speed_between_knots(flip):
     """An interval that goes forward at both ends and backward between them shows it."""
     intervals, speed, brake = 50, 1e-3, 4.0
     s, v = flip.breakpoints[0] + 0.3 * flip.length, speed * flip.length
     torque = [squeeze.best_quasistatic_torque(flip, s, v, a).torque / flip.torque_limit for a in (-brake, brake)]
     q = jnp.concatenate([jnp.array([0.3, speed]), *torque, jnp.zeros(1)])
-    parts, end = _shot(flip, intervals, q)
+    parts, end = _simulate_one(flip, intervals, q)
     phase_schedule = restrict_to_phase(
         wa.torque_schedule([0.0, 1 / intervals], q[2:6].reshape(2, 2) * flip.torque_limit), 0.0, 1 / intervals
     )
@@ -83,18 +82,18 @@ def test_paces_bound_the_speed_between_knots(flip):
     speeds = np.asarray(each(np.arange(int(motion.count)))) * intervals / float(flip.length)
     assert speeds[0, 0] == pytest.approx(speed)
     assert float(end[1]) > 0 > speeds.min()
-    bound = float(parts.pace[parts.pace_weight > 0].min())
+    bound = float(parts.speed[parts.speed_weight > 0].min())
     assert speeds.min() - 0.2 * np.ptp(speeds) < bound < speeds.min()
-    np.testing.assert_allclose(parts.pace_weight.sum(), 1 / intervals)
+    np.testing.assert_allclose(parts.speed_weight.sum(), 1 / intervals)
 
 
 def test_derivatives_of_an_interval_that_is_cut(flip):
-    q, _ = _moving(flip)
+    q, _ = _crossing(flip)
 
     @jax.jit
     def everything(q):
-        parts, end = _shot(flip, 300, q)
-        return jnp.concatenate([parts.forces.ravel(), parts.pace.ravel(), end])
+        parts, end = _simulate_one(flip, 300, q)
+        return jnp.concatenate([parts.force.ravel(), parts.speed.ravel(), end])
 
     exact = jax.jit(jax.jacfwd(everything))(q)
 
@@ -124,24 +123,6 @@ def test_joined_intervals_are_the_phase(knots, late, near):
         dynamics.length
     )
     p = Variables((found.torque.values / dynamics.torque_limit)[None], jnp.asarray(state)[None], jnp.zeros(1))
-    ends = simulate_intervals(dynamics, HOW, knots - 1, interval_inputs(p)[0]).end
+    ends = simulate_intervals(dynamics, OPTIONS, knots - 1, interval_inputs(p)[0]).end
     np.testing.assert_allclose(ends[:-1], state[1:-1], atol=1e-8)
     np.testing.assert_allclose(ends[-1], state[-1], atol=near)  # the simulation lands on the wire's end or on rest
-
-
-def test_a_curved_step_starts_along_its_direction_and_keeps_pinned_torques(flip):
-    rng = np.random.default_rng(3)
-    state = np.stack([np.linspace(0.1, 0.8, 6), np.full(6, 1.0)], axis=1)
-    p = Variables(jnp.asarray(rng.uniform(-0.5, 0.5, (1, 6, 2))), jnp.asarray(state)[None], jnp.zeros(1))
-    phase_dynamics = jax.tree.map(lambda a: a[None], flip)
-    way = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), p)
-    pinned = np.zeros((1, 6), bool)
-    pinned[0, 0] = True
-    one = jnp.ones(())
-    limits = Limits(jnp.full(2, jnp.inf), one[None], one[None], 0 * one, jnp.asarray(pinned), jnp.ones(1))
-    _, tangent = jax.jvp(lambda share: retract(p, way, share, phase_dynamics, limits), (0.0,), (1.0,))
-    for got, want in zip(jax.tree.leaves(tangent), jax.tree.leaves(way), strict=True):
-        np.testing.assert_allclose(got, want, rtol=1e-9)
-    there = retract(p, way, 0.05, phase_dynamics, limits)
-    np.testing.assert_allclose(there.torque[0, 0], p.torque[0, 0] + 0.05 * way.torque[0, 0], rtol=1e-12)
-    assert float(jnp.abs(there.torque[0, 1:] - p.torque[0, 1:] - 0.05 * way.torque[0, 1:]).max()) > 1e-4

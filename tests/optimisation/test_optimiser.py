@@ -11,7 +11,8 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.optimisation.interior_point import DEFECT_TOL, MU_MIN
+from wholearm_jax.optimisation.interior_point import MU_MIN
+from wholearm_jax.optimisation.iteration import DEFECT_TOL
 from wholearm_jax.optimisation.solver import CONVERGED
 from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL
 from wholearm_jax.phases.plan_simulation import simulate
@@ -52,8 +53,8 @@ def test_history_says_what_happened(optimised):
     assert all(found.stopped)
     for row, phase in enumerate(found.result.phases):
         steps = [step for step in found.history if step.phase == row]
-        assert [step.step for step in steps if step.start == 0] == list(range(sum(s.start == 0 for s in steps)))
-        ends = [step for step in steps if step.apart < DEFECT_TOL and step.temperature <= MU_MIN]
+        assert [step.iteration for step in steps if step.start == 0] == list(range(sum(s.start == 0 for s in steps)))
+        ends = [step for step in steps if step.defect_norm < DEFECT_TOL and step.mu <= MU_MIN]
         assert phase.margin == pytest.approx(max(step.margin for step in ends), rel=3e-3), "samples of joined intervals"
 
 
@@ -69,7 +70,7 @@ def test_a_start_that_leads_to_a_known_end_is_not_followed_to_it():
         assert found.stopped[row] == CONVERGED
         last = {step.start: step for step in found.history if step.phase == row}
         assert sorted(last) == [0, 1]
-        assert last[0].apart < DEFECT_TOL < last[1].apart < 1e-2
+        assert last[0].defect_norm < DEFECT_TOL < last[1].defect_norm < 1e-2
         assert last[1].margin == pytest.approx(last[0].margin, rel=0.05)
 
 
@@ -81,12 +82,12 @@ def test_phases_side_by_side_are_what_each_is_alone(optimised):
     def hear(step):
         assert listening.acquire(blocking=False)
         time.sleep(1e-4)
-        heard.append((step.phase, step.start, step.step, step.margin))
+        heard.append((step.phase, step.start, step.iteration, step.margin))
         listening.release()
 
     paths = tuple(phase.traced for phase in both.result.phases)
     again = wa.optimise(scene, traced=paths, callback=hear)
-    assert sorted(heard) == sorted((s.phase, s.start, s.step, s.margin) for s in again.history)
+    assert sorted(heard) == sorted((s.phase, s.start, s.iteration, s.margin) for s in again.history)
     rows = both.torque.values.reshape(len(paths), -1, 2)
     for phase, path, values in zip(scene.phases, paths, rows, strict=True):
         alone = wa.optimise(eqx.tree_at(lambda s: s.phases, scene, (phase,)), traced=(path,))
@@ -142,7 +143,7 @@ def test_durations_are_free_within_their_range():
 def test_any_optax_optimiser_descends():
     found = wa.optimise(wa.load("heptagon"), optimiser=optax.adam(3e-3), steps=100, knots=31)
     flip = [step for step in found.history if step.phase == 1 and step.start == 0]
-    joined = [step.margin for step in flip if step.apart < 1e-3]
+    joined = [step.margin for step in flip if step.defect_norm < 1e-3]
     assert joined[-1] > joined[0] + 0.02
     # Intervals join to 1e-6 by then, about what arriving takes: which start's schedule also arrives is chance.
     assert found.result.phases[1].margin > joined[0] + 0.02
@@ -152,7 +153,7 @@ def test_any_optax_optimiser_descends():
 def test_its_torques_do_not_step_where_a_formation_takes_over_at_speed():
     scene = wa.load("passage")
     found = wa.optimise(scene, optimiser=optax.adam(0.02), steps=60, knots=31)
-    first = [step.apart for step in found.history if step.start == 0]
+    first = [step.defect_norm for step in found.history if step.start == 0]
     assert first[0] > 0.1, "its start must have steps"
     assert first[-1] < 1e-3
 

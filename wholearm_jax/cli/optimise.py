@@ -78,8 +78,8 @@ def _optimise_scene(name: str, scene, options: dict):
         bars = [progress.add_task(p.name, total=options["steps"], state="waiting") for p in scene.phases]
 
         def show(step):
-            state = f"margin {step.margin:.4f} N, apart {step.apart:.0e}"
-            progress.update(bars[step.phase], completed=step.step + 1, state=state)
+            state = f"margin {step.margin:.4f} N, apart {step.defect_norm:.0e}"
+            progress.update(bars[step.phase], completed=step.iteration + 1, state=state)
 
         progress.update(bars[0], state="compiling")
         found = solve(scene, **options, callback=show, traced=traced)

@@ -19,12 +19,14 @@ import optax
 from wholearm_jax.core import Status, as_device_array
 from wholearm_jax.margin import MarginBound
 from wholearm_jax.model import Phase, Scene, TorqueSchedule, concatenate_schedules, pad_schedule, uniform_schedule
+from wholearm_jax.optimisation.constraints import Limits
 from wholearm_jax.optimisation.initial_guess import initial_guesses
-from wholearm_jax.optimisation.interior_point import interior_point, projected
-from wholearm_jax.optimisation.linearisation import Limits
-from wholearm_jax.optimisation.multiple_shooting import Variables, extra_parts
+from wholearm_jax.optimisation.interior_point import interior_point
+from wholearm_jax.optimisation.multiple_shooting import extra_parts
+from wholearm_jax.optimisation.projected_gradient import projected_gradient
 from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.optimisation.solver import CONVERGED, REPEATED, IterationRecord, Problem, solve
+from wholearm_jax.optimisation.variables import Variables
 from wholearm_jax.phases import TracedPhase, rest_intervals, simulate_phase, stack_trees
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
@@ -184,7 +186,7 @@ def _limits(group: CoupledPhases) -> Limits:
 @functools.cache
 def descent_method(optimiser, phases: int, further: int):
     """One transformation for every use, so that programs are not compiled again."""
-    return interior_point(phases, further) if optimiser is None else projected(optimiser)
+    return interior_point(phases, further) if optimiser is None else projected_gradient(optimiser)
 
 
 stacked_tables = jax.jit(stack_trees)

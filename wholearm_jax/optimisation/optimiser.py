@@ -40,6 +40,7 @@ from wholearm_jax.model import (
     round_up,
     uniform_schedule,
 )
+from wholearm_jax.optimisation.constraints import Limits
 from wholearm_jax.optimisation.coupled_phases import (
     SHORTEST,
     TORQUE_SHARE,
@@ -50,11 +51,11 @@ from wholearm_jax.optimisation.coupled_phases import (
     stacked_tables,
 )
 from wholearm_jax.optimisation.initial_guess import initial_guesses
-from wholearm_jax.optimisation.interior_point import init_solver, take_step
-from wholearm_jax.optimisation.linearisation import Limits
-from wholearm_jax.optimisation.multiple_shooting import Variables, extra_parts
+from wholearm_jax.optimisation.iteration import init_solver, take_step
+from wholearm_jax.optimisation.multiple_shooting import extra_parts
 from wholearm_jax.optimisation.rest_transition import RestTransition, holding_schedule, rest_transitions
 from wholearm_jax.optimisation.solver import INTERVAL_OPTIONS, IterationRecord
+from wholearm_jax.optimisation.variables import Variables
 from wholearm_jax.phases import (
     Result,
     TracedPhase,
@@ -167,8 +168,9 @@ def optimise(
     friction, for up to a quarter of a phase until the torque sets it out (`rest_transition`). `durations = (shortest,
     longest)` lets each phase choose its own. Formations that take over at speed are entered with at least `passing`
     times their phase's mean speed (wire over duration): an object that hardly moves where its formation changes may as
-    well stop short of it. `optimiser` replaces the interior point by any optax optimiser (`descent.projected`). A phase
-    stops when its margin comes within `tolerance` of the bound or no longer improves by that share, or after `steps`.
+    well stop short of it. `optimiser` replaces the interior point by any optax optimiser (`projected_gradient`).
+    A phase stops when its margin comes within `tolerance` of the bound or no longer improves by that share, or after
+    `steps`.
     `callback` sees every step, one at a time, but of several phases in no particular order: those that do not follow at
     speed are descended on side by side, each in a thread of its own. `traced` reuses the result of `trace`. A phase
     that holds the object keeps its duration and gets the best torque of its statics, approached and left as fast as

@@ -1,63 +1,59 @@
-"""Pace: one descent from its start to its end: how far its steps go, and when it stops.
+"""The solver: iterations from one initial guess to their end, with safeguards against cycling.
 
-Full steps of the interior point (`descent`) lead on fastest, but may go round in a circle for ever: where knots pass
-kinks of the wire to and fro, and along ways that the loss hardly sees. Who circles is held back, more and more. Once
-the margin has settled, steps only join the intervals: that converges quadratically, as the interior point does not.
-A descent is given up where it comes to where an earlier start led.
+Full interior-point steps converge fastest but can cycle: when knots cross a kink of the path back and forth, or along
+directions in which the objective hardly changes. After a third of the iterations, cycling is damped by half steps, a
+merit test and a growing regularisation. Once the margin has settled, steps only close the defects, which converges
+quadratically. A solve ends early where it comes close to the solution from an earlier guess.
 """
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from wholearm_jax.dynamics import PathDynamics
-from wholearm_jax.optimisation.interior_point import DEFECT_TOL, init_solver, take_step
-from wholearm_jax.optimisation.linearisation import Limits
-from wholearm_jax.optimisation.multiple_shooting import Variables
+from wholearm_jax.optimisation.constraints import Limits
+from wholearm_jax.optimisation.iteration import DEFECT_TOL, SolverState, init_solver, take_step
+from wholearm_jax.optimisation.variables import Variables
 from wholearm_jax.simulation import IntegratorOptions
 
-RISE = 0.01  # most that a step which is held back may raise the merit, as a share of the bound
-DAMPING, DAMPED = 1e-8, 1.3  # price of its size, and by how much that grows from one such step to the next
-CLOSE = 1e-5  # sum of the defects from which full steps close them
-SETTLED, NEARLY = 0.05, 1e-2  # shares of the tolerance by which a margin that settled changes, sum of its defects
-CLOSING = 1e3  # price of a step's size beside which the margin counts little: the smallest step that joins intervals
-LOST = 1e-6  # share of a step at which a descent gives up
-SAME_SOLUTION_TOL = (
-    2e-3,
-    2e-2,
-)  # differences of states at knots [lengths, lengths a duration] with which descents end alike
+MERIT_TOLERANCE = 0.01  # most that a damped step may raise the merit, over the force scale
+REGULARISATION, REGULARISATION_GROWTH = 1e-8, 1.3  # of damped steps: the first one's, and its factor for each further
+CYCLING_DEFECT = 1e-5  # sum of the defects above which an iterate may be cycling
+SETTLED_CHANGE, SETTLED_DEFECT = 0.05, 1e-2  # of a settled margin: largest change over the tolerance, sum of defects
+CLOSING_REGULARISATION = 1e3  # makes the step the smallest one that closes the defects
+MIN_STEP_FRACTION = 1e-6  # shortest step
+SAME_SOLUTION_TOL = (2e-3, 2e-2)  # largest differences of `s` and `v` at the knots between equal solutions
 CONVERGED, REPEATED = "the margin no longer improves", "an earlier start led there, too"
+NO_STEP = "no step leads on"
 INTERVAL_OPTIONS = IntegratorOptions()
 
 
 @dataclass(frozen=True)
 class IterationRecord:
-    """One step of the descent from one of a phase's starts: the temperature as a share of the bound, the least sampled
-    force [N], how far apart the intervals still are (`shooting`), the time it took [s]."""
+    """One iteration of a solve."""
 
-    phase: int
-    start: int
-    step: int
-    temperature: float
-    margin: float
-    apart: float
+    phase: int  # the first of the phases that are solved together
+    start: int  # initial guess
+    iteration: int
+    mu: float  # barrier parameter, over the bound
+    margin: float  # least sampled force [N]; NaN after a rejected step
+    defect_norm: float  # sum of the defects; 0: the intervals join
     seconds: float
 
 
 class Problem(NamedTuple):
-    """What is descended on: phases with their tables and bounds [N] and their `limits`, `phase` being the first's
-    number; at most `steps` steps, and a `tolerance` as a share of the bound."""
+    """Phases that are solved together."""
 
-    phase: int
-    phase_dynamics: PathDynamics
-    bounds: np.ndarray
+    phase: int  # index of the first one
+    phase_dynamics: PathDynamics  # of all, stacked
+    bounds: np.ndarray  # of their margins [N]
     limits: Limits
-    steps: int
-    tolerance: float
+    steps: int  # most iterations
+    tolerance: float  # of the margin, over the bound
 
 
 def solve(
@@ -66,65 +62,97 @@ def solve(
     number: int,
     method,
     callback: Callable[[IterationRecord], None] | None,
-    ended: Sequence[Variables] = (),
+    solutions: Sequence[Variables] = (),
 ) -> tuple[Variables, str, list[IterationRecord]]:
-    """Descend from start number `number`: the variables where it ends, why it ends, and its steps.
+    """Iterate from initial guess `number`.
 
-    `method` is `descent.interior_point` or `descent.projected`; `ended` is where descents from earlier starts
-    ended, of which none is followed to its end again.
+    Args:
+        problem: what is solved.
+        start: the initial guess.
+        number: its index, for the records.
+        method: `interior_point` or `projected_gradient`.
+        callback: called with each record.
+        solutions: solutions from earlier guesses; iterations that come close to one of them end.
+
+    Returns:
+        The last iterate, why iterations ended, and their records.
     """
-    d, rounds, margin_before, history = init_solver(start, method), 0, np.nan, []
-    for count in range(problem.steps):
+    d, cycles, margin_before, history = init_solver(start, method), 0, np.nan, []
+    for iteration in range(problem.steps):
         begun = time.perf_counter()
         after = take_step(d, problem.phase_dynamics, problem.limits, INTERVAL_OPTIONS, method)
-        least, apart, hot, coldest, shares, share = jax.device_get(
-            (
-                after.least,
-                after.apart,
-                after.state.temperature,
-                after.state.coldest,
-                after.state.steps,
-                after.step_fraction,
-            )
-        )
-        margin, near = float((least * problem.bounds).min()), least.min() >= 1 - problem.tolerance
-        spent = time.perf_counter() - begun
-        history.append(IterationRecord(problem.phase, number, count, float(hot), margin, float(apart), spent))
+        record, measures = _measure(problem, after, number, iteration, begun)
+        history.append(record)
         if callback is not None:
-            callback(history[-1])
-        if apart < DEFECT_TOL and hot <= coldest and (shares.min() >= 1 or near):
-            return d.p, CONVERGED, history
-        if share < LOST:
-            return d.p, "no step leads on", history
-        if apart < NEARLY and any(_same_solution(d.p, other) for other in ended):
-            return d.p, REPEATED, history
-        settled = hot <= coldest and apart < NEARLY and _settled(problem, least.min(), margin - margin_before)
-        circling = not settled and count >= problem.steps // 3 and apart > CLOSE
-        rounds, margin_before = rounds + circling, margin
-        d = after._replace(**(_JOINING if settled else _held_back(rounds) if circling else _FULL))
+            callback(record)
+        if (reason := _end_reason(problem, d.p, measures, solutions)) is not None:
+            return d.p, reason, history
+
+        # Choose the next step: full, damped where iterates cycle, or closing the defects once the margin has settled.
+        settled = _has_settled(problem, measures, record.margin - margin_before)
+        cycling = not settled and iteration >= problem.steps // 3 and measures.defect_norm > CYCLING_DEFECT
+        cycles, margin_before = cycles + cycling, record.margin
+        d = replace(after, **(_CLOSING if settled else _damped(cycles) if cycling else _FULL))
     return d.p, f"the limit of {problem.steps} steps", history
 
 
+class _Measures(NamedTuple):
+    """What decides whether and how iterations go on."""
+
+    min_force: np.ndarray  # of each phase, over its force scale
+    defect_norm: float
+    at_mu_min: bool
+    step_lengths: np.ndarray
+    step_fraction: float
+
+
+def _measure(
+    problem: Problem, after: SolverState, number: int, iteration: int, begun: float
+) -> tuple[IterationRecord, _Measures]:
+    """Fetch what an iteration has found out about the iterate before it."""
+    state = after.optimiser
+    values = after.min_force, after.defect_norm, state.mu, state.mu_min, state.step_lengths, after.step_fraction
+    min_force, norm, mu, mu_min, lengths, fraction = jax.device_get(values)
+    margin, seconds = float((min_force * problem.bounds).min()), time.perf_counter() - begun
+    record = IterationRecord(problem.phase, number, iteration, float(mu), margin, float(norm), seconds)
+    return record, _Measures(min_force, norm, mu <= mu_min, lengths, fraction)
+
+
+def _end_reason(problem: Problem, p: Variables, at: _Measures, solutions: Sequence[Variables]) -> str | None:
+    """Return why iterations end at `p`; None where they go on."""
+    at_bound = at.min_force.min() >= 1 - problem.tolerance
+    if at.defect_norm < DEFECT_TOL and at.at_mu_min and (at.step_lengths.min() >= 1 or at_bound):
+        return CONVERGED
+    if at.step_fraction < MIN_STEP_FRACTION:
+        return NO_STEP
+    if at.defect_norm < SETTLED_DEFECT and any(_same_solution(p, other) for other in solutions):
+        return REPEATED
+    return None
+
+
+def _has_settled(problem: Problem, at: _Measures, change: float) -> bool:
+    """Whether the margin is as good as at its bound or no longer changes, at the least barrier parameter."""
+    at_bound = at.min_force.min() >= 1 - problem.tolerance / 2
+    unchanged = abs(change) < SETTLED_CHANGE * problem.tolerance * problem.bounds.min()
+    return bool(at.at_mu_min and at.defect_norm < SETTLED_DEFECT and (at_bound or unchanged))
+
+
 def _same_solution(p: Variables, other: Variables) -> bool:
-    """Whether descents come to one end: states at all knots and durations differ little."""
-    states = np.abs(np.asarray(p.state) - np.asarray(other.state)).max((0, 1))
-    lasting = np.abs(np.asarray(p.log_duration) - np.asarray(other.log_duration)).max()
-    return bool(np.all(states < SAME_SOLUTION_TOL) and lasting < SAME_SOLUTION_TOL[0])
+    """Whether two iterates are close: states at all knots, and durations."""
+    state = np.abs(np.asarray(p.state) - np.asarray(other.state)).max((0, 1))
+    log_duration = np.abs(np.asarray(p.log_duration) - np.asarray(other.log_duration)).max()
+    return bool(np.all(state < SAME_SOLUTION_TOL) and log_duration < SAME_SOLUTION_TOL[0])
 
 
-def _settled(problem: Problem, least, change) -> bool:
-    """Whether a margin is as good as at its bound, or changes no more."""
-    return least >= 1 - problem.tolerance / 2 or abs(change) < SETTLED * problem.tolerance * problem.bounds.min()
+def _damped(cycles: int) -> dict[str, np.ndarray]:
+    """Step control after so many iterations that cycled."""
+    regularisation = REGULARISATION * REGULARISATION_GROWTH**cycles
+    return _step_control(step_scale=0.5, merit_tolerance=MERIT_TOLERANCE, regularisation=regularisation)
 
 
-def _held_back(rounds: int) -> dict[str, np.ndarray]:
-    """How far steps go after so many that circled."""
-    return _settings(reach=0.5, rise=RISE, damping=DAMPING * DAMPED**rounds)
-
-
-def _settings(**values: float) -> dict[str, np.ndarray]:
+def _step_control(**values: float) -> dict[str, np.ndarray]:
     return {name: np.full((), value) for name, value in values.items()}
 
 
-_FULL = _settings(reach=1.0, rise=np.inf, damping=0.0)
-_JOINING = _settings(reach=1.0, rise=np.inf, damping=CLOSING)
+_FULL = _step_control(step_scale=1.0, merit_tolerance=np.inf, regularisation=0.0)
+_CLOSING = _step_control(step_scale=1.0, merit_tolerance=np.inf, regularisation=CLOSING_REGULARISATION)

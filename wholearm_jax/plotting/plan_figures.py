@@ -230,7 +230,7 @@ def plot_history(found: OptimisationResult, ax: Axes | None = None) -> Axes:
         if not steps:
             continue  # it is optimised together with the phase before it
         for start in sorted({step.start for step in steps}):
-            curve = [(step.step, step.margin) for step in steps if step.start == start]
+            curve = [(step.iteration, step.margin) for step in steps if step.start == start]
             label = found.result.phases[phase].name if start == steps[0].start else None
             ax.plot(*np.transpose(curve), color=colour, ls=dashed(start % len(DASHES)), label=label)
         ax.axhline(float(found.bounds[phase].value), color=colour, lw=0.6, ls=":")
