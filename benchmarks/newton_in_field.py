@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core import Program
+from wholearm_jax.core import CachedJit
 from wholearm_jax.dynamics import PathDynamics, equations_of_motion, evaluate, locate_panel
 from wholearm_jax.model import PhaseSchedule, ScaledMechanics, interval, torque_at
 from wholearm_jax.tracing import ContactPath, path_derivatives, solve_on_path
@@ -89,7 +89,7 @@ def solve(way: Direct, segment, s, w, tau, duration):
     return z, at.x, answer[0], answer[1:] * way.mechanics.force_unit
 
 
-@Program
+@CachedJit
 def move(
     way: Direct, phase_schedule: PhaseSchedule, duration, solver: dfx.AbstractSolver, tolerance, max_steps: int
 ) -> Path:
@@ -112,7 +112,7 @@ def move(
     return Path(jnp.stack(steps), jnp.stack(counts))
 
 
-@Program
+@CachedJit
 def moves(
     way: Direct, phase_schedule: PhaseSchedule, durations, solver: dfx.AbstractSolver, tolerance, max_steps: int
 ) -> Path:
@@ -120,7 +120,7 @@ def moves(
     return jax.lax.map(lambda duration: move(way, phase_schedule, duration, solver, tolerance, max_steps), durations)
 
 
-@Program
+@CachedJit
 def states(way: Direct, phase_schedule: PhaseSchedule, duration, path: Path):
     """`z` and `z_dot` (SI) and `c_n` [N] at every step of a path."""
 

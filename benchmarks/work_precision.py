@@ -12,7 +12,7 @@ Every time is that of one phase, warm, taken in turn. The package is timed as `s
 Python and, as a
 share of `MANY` phases that follow one another, within a program; as simulating and scoring (`run`); and with tracing
 and tabulating the wire included. Newton's method, too, is timed called from Python and within a program. All of JAX's
-programs, of both sides, are called as the package calls its own (`Program`) and compiled as `wholearm_jax.configure`
+programs, of both sides, are called as the package calls its own (`CachedJit`) and compiled as `wholearm_jax.configure`
 says, and again in a second process as XLA does by itself (`PLAIN_TYPES`). For each error level the ratio is between the
 fastest runs that are at least as good.
 """
@@ -42,7 +42,7 @@ import numba_loop
 import numpy as np
 
 import wholearm_jax as wa
-from wholearm_jax.core import Program, Status
+from wholearm_jax.core import CachedJit, Status
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.files import scene_toml as scene_file
 from wholearm_jax.model import (
@@ -181,18 +181,18 @@ class Call:
     phases: int = 1
 
 
-@Program
+@CachedJit
 def _move(dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, options: wa.IntegratorOptions) -> Motion:
     return simulate_motion(dynamics, phase_schedule, duration, options=options)
 
 
-@Program
+@CachedJit
 def _moves(dynamics: PathDynamics, phase_schedule: PhaseSchedule, durations, options: wa.IntegratorOptions) -> Motion:
     """One phase after the other."""
     return jax.lax.map(lambda duration: simulate_motion(dynamics, phase_schedule, duration, options=options), durations)
 
 
-@Program
+@CachedJit
 def _at_steps(dynamics: PathDynamics, schedule, start, duration, motion: Motion):
     """`z`, `z_dot`, `c_n` at the motion's steps."""
     there = sample_phase(dynamics, schedule, start, duration, motion, motion.phase_time)

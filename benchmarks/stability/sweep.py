@@ -70,7 +70,7 @@ DIFFERENTIATED = 32  # scenes whose gradients are computed at once
 
 def work(blocks, seed, *, single, target: Path):
     """Run blocks of scenes and write one record a scene."""
-    configure(compiled="well")
+    configure(optimise_for="run_time")
     jax.config.update("jax_enable_x64", not single)
     records = []
     for block in blocks:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.core import config as settings
+from wholearm_jax.core import config
 from wholearm_jax.optimisation.lq_problem import LQStages, ParametricLQ, stage_layout
 from wholearm_jax.optimisation.riccati import _backward_pass
 
@@ -53,40 +53,41 @@ def test_the_recursion_over_knots_is_one_function():
 
 
 @pytest.mark.parametrize(
-    ("compiled", "given", "left"),
+    ("optimise_for", "given", "left"),
     [
-        ("quickly", "", [*settings.FLAGS_ALWAYS, *settings.FLAGS_FOR_COMPILE_TIME]),
-        ("well", "", [*settings.FLAGS_ALWAYS]),
-        ("well", "--xla_dump_to=here", ["--xla_dump_to=here", *settings.FLAGS_ALWAYS]),
+        ("compile_time", "", [*config.FLAGS_ALWAYS, *config.FLAGS_FOR_COMPILE_TIME]),
+        ("run_time", "", [*config.FLAGS_ALWAYS]),
+        ("run_time", "--xla_dump_to=here", ["--xla_dump_to=here", *config.FLAGS_ALWAYS]),
         (
-            "quickly",
+            "compile_time",
             "--xla_cpu_use_fusion_emitters=true --xla_backend_extra_options=one=2",
             [
                 "--xla_cpu_use_fusion_emitters=true",
                 "--xla_backend_extra_options=one=2",
-                *settings.FLAGS_FOR_COMPILE_TIME[1:],
+                *config.FLAGS_FOR_COMPILE_TIME[1:],
             ],
         ),
     ],
 )
-def test_what_a_user_has_set_stays(monkeypatch, compiled, given, left):
+def test_what_a_user_has_set_stays(monkeypatch, optimise_for, given, left):
     monkeypatch.setenv("XLA_FLAGS", given)
-    wa.configure(compiled=compiled)
+    wa.configure(optimise_for=optimise_for)
     assert os.environ["XLA_FLAGS"].split() == left
-    wa.configure(compiled=compiled)
+    wa.configure(optimise_for=optimise_for)
     assert os.environ["XLA_FLAGS"].split() == left
 
 
 @pytest.mark.parametrize(
-    ("compiled", "given", "carried"), [("quickly", None, False), ("quickly", "3", True), ("well", None, True)]
+    ("optimise_for", "given", "carried"),
+    [("compile_time", None, False), ("compile_time", "3", True), ("run_time", None, True)],
 )
-def test_programs_carry_lines_of_python_where_they_are_wanted(monkeypatch, compiled, given, carried):
+def test_programs_carry_lines_of_python_where_they_are_wanted(monkeypatch, optimise_for, given, carried):
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.delenv("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", raising=False)
     jax.config.update("jax_traceback_in_locations_limit", 3)  # as JAX reads it from its environment when imported
     if given:
         monkeypatch.setenv("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", given)
-    wa.configure(compiled=compiled)
+    wa.configure(optimise_for=optimise_for)
     traced = jax.jit(lambda x: jnp.sin(x) + 1.0).lower(1.0)
     assert (Path(__file__).name in traced.as_text(debug_info=True)) == carried
 

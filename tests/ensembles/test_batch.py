@@ -13,6 +13,7 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax.cli import app as command
 from wholearm_jax.cli import check as batch_command
+from wholearm_jax.core.errors import SceneError, StoreError
 from wholearm_jax.core.status import Status
 from wholearm_jax.ensembles import summary as survey_module
 from wholearm_jax.ensembles.batch import check_in_chunks
@@ -21,9 +22,9 @@ from wholearm_jax.ensembles.passes import check_block, trace_block
 from wholearm_jax.ensembles.scene_batch import stack_scenes
 from wholearm_jax.ensembles.scene_check import COARSE_PASS, BatchResult, NextPass, check_scene, from_result
 from wholearm_jax.ensembles.summary import rank_correlations, summarise
-from wholearm_jax.files.check_store import StoreError, fingerprint, open_store, store_metadata
+from wholearm_jax.files.check_store import fingerprint, open_store, store_metadata
 from wholearm_jax.files.polygons_npz import count_polygons, read_polygons
-from wholearm_jax.files.scene_toml import SceneError, to_dict
+from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.model.outline import find_defect
 from wholearm_jax.model.schedule import TorqueSchedule, pad_schedule
 from wholearm_jax.phases.plan_schedule import has_torque_jumps

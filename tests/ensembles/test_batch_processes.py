@@ -13,8 +13,9 @@ import jax
 import numpy as np
 import pytest
 
+from wholearm_jax.core.errors import StoreError
 from wholearm_jax.ensembles.scene_check import BatchResult
-from wholearm_jax.files.check_store import TYPES, StoreError, open_store, store_metadata
+from wholearm_jax.files.check_store import TYPES, open_store, store_metadata
 
 zarr = pytest.importorskip("zarr")
 COUNT, CHUNK, KILLS = 12, 1, 2

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from wholearm_jax.core.atomic_files import write_atomically
+from wholearm_jax.core.errors import SceneError
 from wholearm_jax.core.status import Status
 from wholearm_jax.files.results import read_torque, summary, write_summary, write_torque, write_trajectory
-from wholearm_jax.files.scene_toml import SceneError, load, parse, to_dict
+from wholearm_jax.files.scene_toml import load, parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan_simulation import simulate
 

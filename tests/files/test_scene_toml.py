@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import tomli_w
 
-from wholearm_jax.files.scene_toml import SceneError, bundled, load, parse, save, to_dict
+from wholearm_jax.core.errors import SceneError
+from wholearm_jax.files.scene_toml import bundled, load, parse, save, to_dict
 from wholearm_jax.model.scene import path_target, rigid_body
 
 NAN, INF = float("nan"), float("inf")

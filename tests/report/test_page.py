@@ -7,8 +7,9 @@ import shutil
 import numpy as np
 import pytest
 
+from wholearm_jax.core.errors import SceneError
 from wholearm_jax.files.results import summary, write_summary, write_torque, write_trajectory
-from wholearm_jax.files.scene_toml import SceneError, load, parse, to_dict
+from wholearm_jax.files.scene_toml import load, parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan_simulation import simulate
 from wholearm_jax.report.page import _worst, load_result_folder, render, report

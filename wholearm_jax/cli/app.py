@@ -21,7 +21,7 @@ from wholearm_jax.cli.report import report
 from wholearm_jax.cli.scenes import scenes
 from wholearm_jax.cli.search import search
 from wholearm_jax.cli.simulate import simulate
-from wholearm_jax.core import configure, keep_programs
+from wholearm_jax.core import configure, enable_program_cache
 
 UsageError: Any = typer.BadParameter.__mro__[1]  # of the library beneath, which Typer has under changing names
 
@@ -40,8 +40,6 @@ def main() -> None:
     if sys.argv[1:2] != ["check"]:  # `check` configures itself by the number of its scenes
         configure()
     _keep_compiled()
-    from wholearm_jax.files import SceneError
-
     try:
         sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False) or 0)
     except typer.Abort:
@@ -49,7 +47,7 @@ def main() -> None:
     except UsageError as error:
         print(f"wholearm: {error.format_message()}", file=sys.stderr)
         sys.exit(2)
-    except (SceneError, BadInput) as error:
+    except BadInput as error:
         print(f"wholearm: {error}", file=sys.stderr)
         sys.exit(2)
 
@@ -62,7 +60,7 @@ def _keep_compiled() -> None:
     folder = os.path.join(home, "wholearm_jax")
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
-    keep_programs(Path(folder, "programs"))
+    enable_program_cache(Path(folder, "programs"))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,8 @@ from typing import Annotated
 
 import typer
 
+from wholearm_jax.core import BadInput
+
 ARRIVAL_FRACTION = 0.01  # of a path's length: perturbed plans cannot end where an unperturbed one must
 TORQUE_HELP = "Torque schedule, CSV with the header t,tau1,tau2."
 
@@ -24,10 +26,6 @@ Changes = Annotated[
     typer.Option("--set", help="PHASE.duration=SECONDS; PHASE is a name or a number from 0. May be repeated."),
 ]
 Samples = Annotated[int, typer.Option(min=2, help="Rows a phase in trajectory.csv.")]
-
-
-class BadInput(Exception):
-    """An argument cannot be used; the message is one line."""
 
 
 def load_scene(name: str, changes: list[str] | None = None):

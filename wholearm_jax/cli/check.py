@@ -65,7 +65,7 @@ def check(
     from wholearm_jax.files import count_polygons, read_polygons
 
     expected = count_polygons(polygons) if polygons else count or 0
-    configure(compiled="quickly" if expected < WELL_COMPILED_COUNT else "well")
+    configure(optimise_for="compile_time" if expected < WELL_COMPILED_COUNT else "run_time")
     use_all_processors()
     rank = join_processes(coordinator, processes, process)
     loaded = _load_moving(scene)
@@ -132,18 +132,15 @@ class _Job:
 
 def _run(job: _Job, scene, out: Path, rank: ProcessRank) -> None:
     """Fill the store with all other processes; the first process prints and writes the summary."""
-    from wholearm_jax.files.check_store import StoreError, fingerprint, store_metadata
+    from wholearm_jax.files.check_store import fingerprint, store_metadata
 
     digests = {"scenes": fingerprint(job.source), "torque": fingerprint(job.torque)}
     metadata = store_metadata(job.count, job.chunk, **job.settings, **digests)
-    try:
-        store = _open_shared_store(out, metadata, job, rank)
-        _fill(store, job, rank)
-        rank.wait_for_others("filled")
-        if rank.is_first:
-            print("\n".join(_summarise(store, scene, job.source, out).lines))
-    except StoreError as error:
-        raise BadInput(str(error)) from None
+    store = _open_shared_store(out, metadata, job, rank)
+    _fill(store, job, rank)
+    rank.wait_for_others("filled")
+    if rank.is_first:
+        print("\n".join(_summarise(store, scene, job.source, out).lines))
 
 
 def _open_shared_store(out: Path, metadata, job: _Job, rank: ProcessRank):

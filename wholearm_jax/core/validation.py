@@ -1,11 +1,11 @@
-"""Requirements: what functions need of their arguments and of JAX, said at once and in one line."""
+"""Requirements of public functions on their arguments and on JAX, checked before anything is computed."""
 
 import jax.numpy as jnp
 
 
 def require_x64() -> None:
-    """Raise unless JAX computes in 64 bits: the statuses' tolerances need them."""
-    if jnp.result_type(float) != jnp.float64:  # an array would wait for the compiler while programs compile beside
+    """Raise RuntimeError unless JAX computes in float64, which the tolerances of statuses need."""
+    if jnp.result_type(float) != jnp.float64:  # asking an array would wait for programs that compile in the background
         raise RuntimeError("this function needs float64; call wholearm_jax.configure() before JAX computes anything")
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from wholearm_jax.core import Program, call_in_background, wait_for
+from wholearm_jax.core import CachedJit, compile_in_background, wait_for
 from wholearm_jax.ensembles.ensemble import Ensemble
 from wholearm_jax.ensembles.scene_batch import SceneBatch, SceneSource
 from wholearm_jax.ensembles.scene_check import BatchResult, Fidelity, check_on_paths
@@ -53,7 +53,7 @@ def _check_block(source: SceneSource, numbers, schedule: TorqueSchedule, arrival
     """Check `BLOCK` scenes a device."""
     side_by_side = mesh.devices.flat[0].platform != "cpu"
     common = source, schedule, arrival, fidelity, side_by_side
-    compiled = call_in_background(_precompile_checks, mesh, common, numbers)
+    compiled = compile_in_background(_precompile_checks, mesh, common, numbers)
     paths = _call_on_devices(mesh, trace_block, (source, fidelity.resolution, side_by_side), numbers)
     wait_for(compiled)
     return _call_on_devices(mesh, check_block, common, numbers, paths)
@@ -69,13 +69,13 @@ def _precompile_checks(mesh: Mesh, common: tuple, numbers) -> None:
     _call_on_devices(mesh, check_block, common, numbers, paths)
 
 
-def _call_on_devices(mesh: Mesh, program: Program, common: tuple, *per_device):
+def _call_on_devices(mesh: Mesh, program: CachedJit, common: tuple, *per_device):
     """Call a program with `common` arguments, and with `per_device` arguments split over the devices."""
     return program(common, *per_device) if mesh.size == 1 else _call_sharded(mesh, program, common, *per_device)
 
 
-@Program
-def _call_sharded(mesh: Mesh, program: Program, common: tuple, *per_device):
+@CachedJit
+def _call_sharded(mesh: Mesh, program: CachedJit, common: tuple, *per_device):
     """Call a program on every device with its own part of the `per_device` arguments."""
     arrays, static = eqx.partition(common, eqx.is_array)
 
@@ -87,7 +87,7 @@ def _call_sharded(mesh: Mesh, program: Program, common: tuple, *per_device):
     return jax.shard_map(local, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)(arrays, *per_device)
 
 
-@Program
+@CachedJit
 def trace_block(common, numbers):
     """Trace the paths of scenes, once if all have the same; `common` is (source, resolution, side by side)."""
     source, resolution, side_by_side = common
@@ -98,7 +98,7 @@ def trace_block(common, numbers):
     return _map_scenes(trace_scene, side_by_side)(numbers[:1] if source.has_common_paths else numbers)
 
 
-@Program
+@CachedJit
 def check_block(common, numbers, paths):
     """Check scenes on their paths; `common` is (source, schedule, arrival, fidelity, side by side)."""
     source, schedule, arrival, fidelity, side_by_side = common

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from wholearm_jax.core import Program, Status
+from wholearm_jax.core import CachedJit, Status
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.ensembles.ensemble import Ensemble
 from wholearm_jax.margin import log_barrier_minimum
@@ -48,7 +48,7 @@ class SampledMargins(NamedTuple):
     gradient: Float[Array, "rows 2"]  # [1/m]
 
 
-@Program
+@CachedJit
 def trace_samples(ensemble: Ensemble, numbers) -> SampledScenes:
     """Draw scenes of an ensemble and trace their phases."""
 
@@ -59,7 +59,7 @@ def trace_samples(ensemble: Ensemble, numbers) -> SampledScenes:
     return jax.lax.map(trace_scene, numbers, batch_size=32)
 
 
-@Program
+@CachedJit
 def margins_and_gradient(
     torque: TorqueSchedule, samples: SampledScenes, arrival, options: IntegratorOptions
 ) -> SampledMargins:

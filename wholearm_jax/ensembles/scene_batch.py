@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from wholearm_jax.core import stack_trees
 from wholearm_jax.model import Scene
-from wholearm_jax.phases import stack_trees
 
 
 class SceneSource(Protocol):

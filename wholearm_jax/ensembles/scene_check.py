@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core import Status
+from wholearm_jax.core import Status, stack_trees
 from wholearm_jax.dynamics import PathDynamics, tabulate_path_dynamics
 from wholearm_jax.model import ContactFormation, Scene, TorqueSchedule, rigid_body, scaled_mechanics
 from wholearm_jax.phases import (
@@ -19,7 +19,6 @@ from wholearm_jax.phases import (
     initial_carry,
     phase_inputs,
     scan_step,
-    stack_trees,
     trace_paths_in_one_program,
 )
 from wholearm_jax.simulation import IntegratorOptions

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from joblib import Parallel, delayed
 
-from wholearm_jax.core import require_positive
+from wholearm_jax.core import require_positive, unstack_trees
 from wholearm_jax.ensembles import make_ensemble, wilson_interval
 from wholearm_jax.execution.executions import (
     ExecutionOutcome,
@@ -45,7 +45,7 @@ from wholearm_jax.model import (
     rigid_body,
     scaled_mechanics,
 )
-from wholearm_jax.phases import Result, unstack_trees
+from wholearm_jax.phases import Result
 
 
 class Amounts(NamedTuple):

@@ -13,21 +13,11 @@ from wholearm_jax.files.results import (
     write_torque,
     write_trajectory,
 )
-from wholearm_jax.files.scene_toml import (
-    Positive,
-    SceneError,
-    bundled,
-    explain_validation_error,
-    load,
-    parse,
-    save,
-    to_dict,
-)
+from wholearm_jax.files.scene_toml import Positive, bundled, explain_validation_error, load, parse, save, to_dict
 
 __all__ = [
     "TRAJECTORY_COLUMNS",
     "Positive",
-    "SceneError",
     "bundled",
     "count_polygons",
     "discard",

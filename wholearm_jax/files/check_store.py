@@ -17,15 +17,12 @@ import numpy as np
 import zarr
 from zarr.errors import GroupNotFoundError
 
+from wholearm_jax.core import StoreError
 from wholearm_jax.ensembles import BatchResult
 
 KIND = "wholearm_jax check"
 # Status, contact and phase numbers are small; -1 marks "none".
 TYPES = {"status": "int8", "margin": "float64", "time": "float64", "contact": "int8", "phase": "int8", "end": "float64"}
-
-
-class StoreError(Exception):
-    """A store cannot be used; the message is one line."""
 
 
 def fingerprint(*trees: Any) -> str:

@@ -12,8 +12,8 @@ from zlib import error as ZlibError
 import jax
 import numpy as np
 
+from wholearm_jax.core import SceneError
 from wholearm_jax.ensembles import SceneBatch
-from wholearm_jax.files.scene_toml import SceneError
 from wholearm_jax.model import Polygon, Scene, find_defect
 
 _UNREADABLE = (OSError, ValueError, KeyError, AttributeError, TypeError, EOFError, BadZipFile, ZlibError)

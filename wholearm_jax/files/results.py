@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wholearm_jax.core import write_atomically
-from wholearm_jax.files.scene_toml import CONSTRAINTS, SceneError, to_dict
+from wholearm_jax.core import SceneError, write_atomically
+from wholearm_jax.files.scene_toml import CONSTRAINTS, to_dict
 from wholearm_jax.model import COORDINATES, TorqueSchedule, torque_schedule
 from wholearm_jax.phases import Result, trajectory
 

@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from wholearm_jax.core import as_device_array, write_atomically
+from wholearm_jax.core import SceneError, as_device_array, write_atomically
 from wholearm_jax.model import (
     COORDINATES,
     LINKS,
@@ -36,10 +36,6 @@ from wholearm_jax.model import (
 )
 
 CONSTRAINTS = 4
-
-
-class SceneError(ValueError):
-    """A scene or schedule that cannot be used; the message names the file, the key and the cause."""
 
 
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -197,7 +193,7 @@ def load(name: str | Path) -> Scene:
     ['slide left', 'flip right']
     >>> wa.load("heptagn")
     Traceback (most recent call last):
-    wholearm_jax.files.scene_toml.SceneError: heptagn: no such file; did you mean the bundled scene 'heptagon'?
+    wholearm_jax.core.errors.SceneError: heptagn: no such file; did you mean the bundled scene 'heptagon'?
     """
     if str(name) in bundled():
         text = (resources.files("wholearm_jax") / "scenes" / f"{name}.toml").read_text("utf-8")
@@ -227,7 +223,7 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
     >>> data["object"]["mass"] = -1.0
     >>> wa.parse(data, source="mine")
     Traceback (most recent call last):
-    wholearm_jax.files.scene_toml.SceneError: mine: object.mass: must be greater than 0, not -1.0
+    wholearm_jax.core.errors.SceneError: mine: object.mass: must be greater than 0, not -1.0
     """
     try:
         checked = _Scene.model_validate(data)

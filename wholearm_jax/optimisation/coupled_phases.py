@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import optax
 
-from wholearm_jax.core import Status, as_device_array
+from wholearm_jax.core import Status, as_device_array, stack_trees
 from wholearm_jax.margin import MarginBound
 from wholearm_jax.model import Phase, Scene, TorqueSchedule, concatenate_schedules, pad_schedule, uniform_schedule
 from wholearm_jax.optimisation.constraints import Limits
@@ -27,7 +27,7 @@ from wholearm_jax.optimisation.projected_gradient import projected_gradient
 from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.optimisation.solver import CONVERGED, REPEATED, IterationRecord, Problem, solve
 from wholearm_jax.optimisation.variables import Variables
-from wholearm_jax.phases import TracedPhase, rest_intervals, simulate_phase, stack_trees
+from wholearm_jax.phases import TracedPhase, rest_intervals, simulate_phase
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
 TORQUE_SHARE = 0.9  # share of the torque limits that a start may use

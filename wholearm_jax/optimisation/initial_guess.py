@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from wholearm_jax.core import Program, as_device_array
+from wholearm_jax.core import CachedJit, as_device_array
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.margin import best_quasistatic_torque_batch
 from wholearm_jax.optimisation.constraints import impact_speed_ratio
@@ -122,7 +122,7 @@ def _profile_motion(knots: int, p: float, q: float) -> UnitMotion:
     return s, v, a
 
 
-_best_torques = Program(jax.vmap(best_quasistatic_torque_batch, (None, 0, 0, 0)))
+_best_torques = CachedJit(jax.vmap(best_quasistatic_torque_batch, (None, 0, 0, 0)))
 
 
 @jax.jit

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from wholearm_jax.core import Program
+from wholearm_jax.core import CachedJit
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.margin import log_barrier_minimum
 from wholearm_jax.optimisation.constraints import Limits
@@ -76,7 +76,7 @@ def defect_norm(linear: LinearisedProblem) -> Float[Array, ""]:
     return jnp.abs(linear.defect).sum()
 
 
-@Program
+@CachedJit
 def init_solver(p: Variables, optimiser) -> SolverState:
     """Return the state before the first step of a method, `interior_point` or `projected_gradient`."""
     zero, infinite = jnp.zeros(()), jnp.zeros(()) + jnp.inf
@@ -97,7 +97,7 @@ def init_solver(p: Variables, optimiser) -> SolverState:
     )
 
 
-@Program
+@CachedJit
 def take_step(
     d: SolverState, phase_dynamics: PathDynamics, limits: Limits, options: IntegratorOptions, optimiser
 ) -> SolverState:

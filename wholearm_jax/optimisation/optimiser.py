@@ -20,11 +20,11 @@ import numpy as np
 import optax
 
 from wholearm_jax.core import (
-    BackgroundCall,
-    Program,
+    BackgroundTask,
+    CachedJit,
     Status,
     as_device_array,
-    call_in_background,
+    compile_in_background,
     require_positive,
     require_x64,
     wait_for,
@@ -275,16 +275,18 @@ def _lasting(scene: Scene, duration: float) -> Scene:
 
 def precompile_optimise(
     scene: Scene, *, knots: int = 51, optimiser: optax.GradientTransformation | None = None
-) -> tuple[BackgroundCall, ...]:
+) -> tuple[BackgroundTask, ...]:
     """Compile what `optimise` runs in a thread of its own, while wires are traced; it is to be waited for."""
     sizes = sorted({len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"})
     rolling = sorted({_rolling(p) for p in scene.phases if p.arrive != "hold"})
-    squeezes = call_in_background(_squeeze_blank, tuple(sizes), tuple(rolling), knots)
-    descents = [call_in_background(_advance_blank, n, knots, optimiser) for n in sizes]
+    squeezes = compile_in_background(_squeeze_blank, tuple(sizes), tuple(rolling), knots)
+    descents = [compile_in_background(_advance_blank, n, knots, optimiser) for n in sizes]
     return (
         squeezes,
         *descents,
-        call_in_background(precompile_simulation, _rows(scene, knots), with_step_capacity(IntegratorOptions(), knots)),
+        compile_in_background(
+            precompile_simulation, _rows(scene, knots), with_step_capacity(IntegratorOptions(), knots)
+        ),
     )
 
 
@@ -328,4 +330,4 @@ def _advance_blank(phases: int, knots: int, optimiser: optax.GradientTransformat
     take_step(init_solver(p, method), phase_dynamics, limits, INTERVAL_OPTIONS, method)
 
 
-_bound = Program(margin_upper_bound)
+_bound = CachedJit(margin_upper_bound)

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core import Program, Status, as_device_array
+from wholearm_jax.core import CachedJit, Status, as_device_array
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.margin import (
     MARGIN_TIE,
@@ -331,7 +331,7 @@ def _terms_at(dynamics: PathDynamics, end: int):
     return jax.device_get(_terms(dynamics, dynamics.breakpoints[end]))
 
 
-@Program
+@CachedJit
 def _terms(dynamics: PathDynamics, s) -> tuple[Float[Array, "5"], Float[Array, "slacks 5"]]:
     """Coefficients of the acceleration and of the slacks at a place of a wire."""
     motion, forces = affine_coefficients(dynamics, s)

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from wholearm_jax.core import BackgroundCall, Status, call_in_background, require_x64, wait_for
+from wholearm_jax.core import BackgroundTask, Status, compile_in_background, require_x64, wait_for
 from wholearm_jax.margin import affine_coefficients, best_quasistatic_torque
 from wholearm_jax.model import Phase, Scene, TorqueSchedule, pad_schedule, replace_duration, round_up
 from wholearm_jax.phases import (
@@ -80,9 +80,9 @@ def search_by_steps(scene: Scene, *, longest: float = 10.0, traced: tuple[Traced
     return SearchResult(found, schedule, result, count + len(phases), time.perf_counter() - begun)
 
 
-def precompile_search() -> BackgroundCall:
+def precompile_search() -> BackgroundTask:
     """Compile what `search_by_steps` runs in a thread of its own, while wires are traced; it is to be waited for."""
-    return call_in_background(precompile_simulation, round_up(2), IntegratorOptions())
+    return compile_in_background(precompile_simulation, round_up(2), IntegratorOptions())
 
 
 def _arriving(phase: Phase) -> Phase:

@@ -15,7 +15,7 @@ from wholearm_jax.phases.plan_simulation import (
     simulate,
     simulate_phases,
 )
-from wholearm_jax.phases.plan_tracing import stack_trees, trace, trace_paths_in_one_program, unstack_trees
+from wholearm_jax.phases.plan_tracing import trace, trace_paths_in_one_program
 from wholearm_jax.phases.rest_certificate import certify_rest
 from wholearm_jax.phases.result import Result, build_result, rest_intervals
 from wholearm_jax.phases.sampling import DEFAULT_SAMPLES, sample_phase, trajectory

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core import Program, Status, as_device_array, as_strong_array
+from wholearm_jax.core import CachedJit, Status, as_device_array, as_strong_array
 from wholearm_jax.dynamics import Impact, PathDynamics, evaluate, locate_panel, placeholder_dynamics, resolve_impact
 from wholearm_jax.margin import MarginResult, minimum_margin
 from wholearm_jax.model import TorqueSchedule, restrict_to_phase, uniform_schedule
@@ -64,7 +64,7 @@ def simulate_phase(
     return _simulate_phase(dynamics, schedule, start, duration, incoming_velocity, options, goal, arrival)
 
 
-@Program
+@CachedJit
 def _simulate_phase(
     dynamics: PathDynamics,
     schedule: TorqueSchedule,

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from wholearm_jax.core import Program, Status, eps_power
+from wholearm_jax.core import CachedJit, Status, eps_power
 from wholearm_jax.dynamics import PathDynamics, tabulate_path_dynamics
 from wholearm_jax.model import PathTarget, ScaledMechanics, scaled_mechanics
 from wholearm_jax.tracing import ContactPath, Resolution, trace_path
@@ -28,7 +28,7 @@ class TracedPhase(NamedTuple):
     end: Float[Array, "5"]  # `z` (SI) at the path's end
 
 
-@Program
+@CachedJit
 def trace_phase(
     body,
     hand,

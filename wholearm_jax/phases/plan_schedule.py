@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wholearm_jax.core import is_transformed
+from wholearm_jax.core import is_traced
 from wholearm_jax.model import Scene, TorqueSchedule, has_jumps
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
@@ -28,7 +28,7 @@ def with_plan_step_capacity(options: IntegratorOptions, scene: Scene, torque: To
     Counted are the rows within a phase, or all where times or durations are being transformed.
     """
     rows = torque.times.shape[0]
-    if not is_transformed(torque.times, [phase.duration for phase in scene.phases]):
+    if not is_traced(torque.times, [phase.duration for phase in scene.phases]):
         ends = np.cumsum([0.0, *(float(phase.duration) for phase in scene.phases)])
         rows = int(np.max(np.diff(np.searchsorted(np.asarray(torque.times), ends))))
     return with_step_capacity(options, rows)
@@ -39,7 +39,7 @@ def has_torque_jumps(scenes: Scene, torque: TorqueSchedule) -> bool:
 
     False where times or durations are being transformed.
     """
-    if is_transformed(torque.times, [phase.duration for phase in scenes.phases]):
+    if is_traced(torque.times, [phase.duration for phase in scenes.phases]):
         return False
     ends = np.cumsum([np.asarray(phase.duration) for phase in scenes.phases], axis=0)
     first = 0.0

@@ -13,13 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from wholearm_jax.core import (
-    BackgroundCall,
+    BackgroundTask,
     Status,
     as_device_array,
-    call_in_background,
-    is_transformed,
+    compile_in_background,
+    is_traced,
     require_positive,
     require_x64,
+    stack_trees,
+    unstack_trees,
     wait_for,
 )
 from wholearm_jax.model import Phase, Scene, TorqueSchedule, pad_schedule, round_up
@@ -27,7 +29,7 @@ from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL, GOALS
 from wholearm_jax.phases.phase_simulation import SimulatedPhase, precompile_simulation, simulate_phase
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.phases.plan_schedule import has_torque_jumps, require_covered, with_plan_step_capacity
-from wholearm_jax.phases.plan_tracing import stack_trees, trace, unstack_trees
+from wholearm_jax.phases.plan_tracing import trace
 from wholearm_jax.phases.result import Result, build_result
 from wholearm_jax.simulation import IntegratorOptions, tolerance_as_data
 
@@ -88,10 +90,10 @@ def simulate(
 
 def precompile_simulate(
     scene: Scene, torque: TorqueSchedule, tolerance: float = 1e-10, max_steps: int = 256
-) -> BackgroundCall:
+) -> BackgroundTask:
     """Compile the programs of `simulate` in the background, while paths are traced, and return the task to wait for."""
     options = _integrator_options(scene, torque, tolerance, max_steps)
-    return call_in_background(precompile_simulation, round_up(len(torque.times)), options)
+    return compile_in_background(precompile_simulation, round_up(len(torque.times)), options)
 
 
 def _integrator_options(scene: Scene, torque: TorqueSchedule, tolerance: float, max_steps: int) -> IntegratorOptions:
@@ -111,7 +113,7 @@ def simulate_phases(
     """Simulate every phase; differentiable, and usable under any JAX transformation."""
     schedule, phases = pad_schedule(torque), list(zip(traced, scene.phases, strict=True))
     same_shapes = len({tuple(leaf.shape for leaf in jax.tree.leaves(one)) for one in traced}) == 1
-    if same_shapes and is_transformed(scene, torque, traced):
+    if same_shapes and is_traced(scene, torque, traced):
         stacked = stack_trees([(path.dynamics, *phase_inputs(phase)) for path, phase in phases])
         dtype = torque.times.dtype
         options = tolerance_as_data(options, dtype)

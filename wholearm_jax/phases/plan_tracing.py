@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from wholearm_jax.core import Status, as_device_array, is_transformed
+from wholearm_jax.core import Status, as_device_array, is_traced, stack_trees, unstack_trees
 from wholearm_jax.model import Phase, Scene, rigid_body, scaled_mechanics
 from wholearm_jax.phases.phase_ends import target_configuration
 from wholearm_jax.phases.phase_tracing import TracedPhase, trace_phase, trace_phase_path
@@ -35,7 +35,7 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     >>> print(f"{float(traced[0].dynamics.length):.2f} object radii")
     1.33 object radii
     """
-    if is_transformed(scene):  # shapes are fixed there: the caller has chosen the resolution
+    if is_traced(scene):  # shapes are fixed there: the caller has chosen the resolution
         return unstack_trees(trace_in_one_program(scene, resolution), len(scene.phases))
     body, initial_guess, traced_phases = rigid_body(scene.object), scene.start, []
     for phase in scene.phases:
@@ -85,16 +85,6 @@ def _scan_phases(trace_one, scene: Scene, resolution: Resolution):
 
     phases = stack_trees([(p.formation, p.target, jnp.asarray(p.arrive == "hold")) for p in scene.phases])
     return jax.lax.scan(step, (scene.start, jnp.asarray(True)), phases)[1]
-
-
-def stack_trees(trees):
-    """Stack trees of one structure along a new leading axis."""
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
-
-
-def unstack_trees(stacked, count: int) -> tuple:
-    """Split a stacked tree into its `count` trees."""
-    return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], stacked) for k in range(count))
 
 
 def _trace_refined(

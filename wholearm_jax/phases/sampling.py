@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core import Program, Status, require_positive
+from wholearm_jax.core import CachedJit, Status, require_positive
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.margin import contact_force, dense_output, evaluate_dense
 from wholearm_jax.model import TorqueSchedule, interval, pad_schedule, restrict_to_phase, round_up, torque_at
@@ -40,7 +40,7 @@ def by_contact(dynamics: PathDynamics, segment, forces: Float[Array, "rows"]):
     return tuple(jnp.where(slot >= 0, values[slot], jnp.nan) for values in (forces, tangential))
 
 
-@Program
+@CachedJit
 def sample_phase(
     dynamics: PathDynamics, schedule: TorqueSchedule, start, duration, motion: Motion, phase_times
 ) -> Trajectory:

@@ -19,8 +19,8 @@ import tomli_w
 from jinja2 import Environment, PackageLoader
 from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
-from wholearm_jax.core import Status
-from wholearm_jax.files import TRAJECTORY_COLUMNS, Positive, SceneError, explain_validation_error, parse, read_torque
+from wholearm_jax.core import SceneError, Status
+from wholearm_jax.files import TRAJECTORY_COLUMNS, Positive, explain_validation_error, parse, read_torque
 from wholearm_jax.model import (
     COORDINATES,
     Scene,
