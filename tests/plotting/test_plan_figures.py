@@ -9,15 +9,9 @@ from wholearm_jax.files.scene_toml import load, parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan_simulation import simulate
 from wholearm_jax.plotting.palette import CONTACT_COLOURS, DASHES, contact_styles
-from wholearm_jax.plotting.plan_figures import (
-    COLUMN,
-    PAPER,
-    plot_forces,
-    plot_pose,
-    plot_result,
-    plot_strip,
-    plot_torques,
-)
+from wholearm_jax.plotting.plan_figures import plot_forces, plot_result, plot_torques
+from wholearm_jax.plotting.pose_figures import plot_pose, plot_strip
+from wholearm_jax.plotting.style import COLUMN, PAPER
 
 mpl.use("agg")
 

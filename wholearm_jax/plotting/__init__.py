@@ -3,22 +3,22 @@
 import importlib
 
 _MODULES = {
-    "COLUMN": "plan_figures",
+    "COLUMN": "style",
     "LINK_COLOURS": "palette",
-    "PAGE": "plan_figures",
-    "PAPER": "plan_figures",
+    "PAGE": "style",
+    "PAPER": "style",
     "animate": "execution_figures",
     "plot_ensemble": "ensemble_figures",
     "plot_execution": "execution_figures",
     "plot_execution_strip": "execution_figures",
     "plot_forces": "plan_figures",
     "plot_history": "plan_figures",
-    "plot_pose": "plan_figures",
+    "plot_pose": "pose_figures",
     "plot_result": "plan_figures",
-    "plot_strip": "plan_figures",
-    "plot_successors": "plan_figures",
+    "plot_strip": "pose_figures",
+    "plot_successors": "pose_figures",
     "plot_torques": "plan_figures",
-    "save_figure": "plan_figures",
+    "save_figure": "style",
 }
 
 __all__ = sorted(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -1,7 +1,4 @@
-"""Figures of executions: contact forces, deviation and contacts over time, poses, and an animation.
-
-Functions take and return axes as those of `drawing` do.
-"""
+"""Figures of executions: contact forces, deviation and contacts over time, poses, and an animation."""
 
 from __future__ import annotations
 
@@ -16,14 +13,15 @@ from matplotlib.patches import Polygon as Patch
 from wholearm_jax.model import feature_pair, rigid_body
 from wholearm_jax.plotting.palette import CONTACT_COLOURS, contact_styles
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
-from wholearm_jax.plotting.plan_figures import INK, PAGE, PALE, outline_at, over_time, plot_pose, pose_grid
+from wholearm_jax.plotting.pose_figures import object_outline, plot_pose, pose_grid
+from wholearm_jax.plotting.style import INK, PAGE, PALE, format_time_axis
 
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
     from wholearm_jax.execution import Execution
 
 
 def plot_execution(execution: Execution, axes=None) -> np.ndarray:
-    """An execution on top of its prediction: contact forces, deviation of the object, and which contacts touch.
+    """Plot an execution over its prediction: contact forces, deviation of the object, and which contacts touch.
 
     Takes and returns three axes.
     """
@@ -40,16 +38,16 @@ def plot_execution(execution: Execution, axes=None) -> np.ndarray:
 
 
 def plot_execution_strip(execution: Execution, poses: int = 8, axes=None) -> np.ndarray:
-    """An execution as a strip of poses, the predicted object dashed; takes and returns an array of axes."""
+    """Plot an execution as a strip of poses, the predicted object dashed; takes and returns an array of axes."""
     axes = pose_grid(axes, 2, (poses + 1) // 2, 0.95)
     shown = np.linspace(0, len(execution.course.time) - 1, axes.size).round().astype(int)
     for ax, row in zip(axes.flat, shown, strict=True):
-        _draw_moment(execution, row, ax)
+        _plot_step(execution, row, ax)
     return axes
 
 
 def animate(execution: Execution, frames_per_second: int = 25, ax: Axes | None = None) -> FuncAnimation:
-    """An execution in real time, the predicted object dashed."""
+    """Animate an execution in real time, the predicted object dashed."""
     times = execution.course.time
     count = max(2, round(times[-1] * frames_per_second) + 1)
     shown = np.searchsorted(times, np.linspace(0, times[-1], count) - 1e-9)
@@ -61,7 +59,7 @@ def animate(execution: Execution, frames_per_second: int = 25, ax: Axes | None =
 
     def show(row):
         ax.clear()
-        _draw_moment(execution, row, ax)
+        _plot_step(execution, row, ax)
         ax.set_xlim(-across, across)
         ax.set_ylim(-0.1 * reach, 1.2 * reach)
         return ()
@@ -69,19 +67,19 @@ def animate(execution: Execution, frames_per_second: int = 25, ax: Axes | None =
     return FuncAnimation(figure, show, frames=shown, interval=1000 / frames_per_second)
 
 
-def _draw_moment(execution: Execution, row: int, ax: Axes) -> None:
-    """The executed pose of one step, and the predicted object's outline."""
+def _plot_step(execution: Execution, row: int, ax: Axes) -> None:
+    """Plot the executed pose of time step `row`, and the predicted object's outline."""
     time = execution.course.time[row]
     plot_pose(execution.prediction.scene, execution.course.z[row], ax, label=f"$t$ = {time:.2f} s")
     expected = execution.expected
     if time <= expected.time[-1] + 1e-9:
         z = expected.z[min(np.searchsorted(expected.time, time - 1e-9), len(expected.time) - 1)]
-        outline = outline_at(execution.prediction.scene, z)
+        outline = object_outline(execution.prediction.scene, z)
         ax.add_patch(Patch(outline, closed=True, fill=False, edgecolor=COLOURS[1], lw=0.8, ls="--", zorder=4))
 
 
 def plot_execution_forces(execution: Execution, ax: Axes | None = None) -> Axes:
-    """Executed contact forces [N] over time, thin, on those that were predicted, pale and wide."""
+    """Plot executed contact forces [N] over time, thin, on predicted ones, pale and wide."""
     ax = ax or plt.gca()
     expected = execution.expected
     for name in execution.planned:
@@ -91,17 +89,17 @@ def plot_execution_forces(execution: Execution, ax: Axes | None = None) -> Axes:
         ax.plot(expected.time, predicted, color=colour, lw=3.5, alpha=0.35, solid_capstyle="butt")
         executed = execution.course.cn[:, column]
         ax.plot(execution.course.time, np.where(executed > 0, executed, np.nan), color=colour, lw=0.9, label=name)
-    # What contacts do as they are made would hide the rest; where no forces are predicted, they are all there is.
+    # The range is that of the predicted forces, because impact peaks would hide them; of the executed without any.
     high = np.nanmax(np.where(np.isfinite(expected.cn), expected.cn, 0.0)) or execution.course.cn.max() or 1.0
     ax.set_ylim(-0.03 * high, 1.35 * high)
     ax.plot([], [], color=PALE, lw=3.5, alpha=0.6, label="predicted")
     ax.set_ylabel("contact force $c_n$ [N]")
-    over_time(ax, execution.prediction)
+    format_time_axis(ax, execution.prediction)
     return _legend_beside(ax)
 
 
 def plot_deviation(execution: Execution, ax: Axes | None = None) -> Axes:
-    """How far the executed object is from the predicted one over time [mm]: its centre, and its angle at its rim."""
+    """Plot the executed object's deviation from the prediction [mm]: of its centre, and angle times radius."""
     ax = ax or plt.gca()
     course, expected = execution.course, execution.expected
     z = np.stack([np.interp(expected.time, course.time, course.z[:, k]) for k in range(3)], axis=1)
@@ -110,14 +108,14 @@ def plot_deviation(execution: Execution, ax: Axes | None = None) -> Axes:
     rim = 1e3 * np.hypot(*corners.T).max() * np.abs(off[:, 2])
     ax.plot(expected.time, 1e3 * np.hypot(off[:, 0], off[:, 1]), color=COLOURS[0], label="centre of mass")
     ax.plot(expected.time, rim, color=COLOURS[1], ls="--", label="angle, at its rim")
-    over_time(ax, execution.prediction, named=False)
+    format_time_axis(ax, execution.prediction, named=False)
     ax.set_ylim(bottom=0)
     ax.set_ylabel("deviation [mm]")
     return _legend_beside(ax)
 
 
 def plot_touching(execution: Execution, ax: Axes | None = None) -> Axes:
-    """A pale bar while a contact is predicted to touch, and a full one within it while it does."""
+    """Plot a pale bar while a contact is predicted to touch, and a dark one inside it while it does."""
     ax = ax or plt.gca()
     shown = [n for n in execution.names if n in execution.planned or _touches(execution, n)]
     for place, name in enumerate(shown):
@@ -126,7 +124,7 @@ def plot_touching(execution: Execution, ax: Axes | None = None) -> Axes:
         for course, height, alpha in ((execution.expected, 0.8, 0.35), (execution.course, 0.3, 1.0)):
             for begin, end in _spans(course.time, course.touch[:, column]):
                 ax.barh(place, end - begin, left=begin, height=height, color=colour, alpha=alpha, lw=0)
-    over_time(ax, execution.prediction, named=False, zero=False)
+    format_time_axis(ax, execution.prediction, named=False, zero=False)
     ax.set_yticks(range(len(shown)), shown)
     ax.set_ylim(len(shown) - 0.5, -0.5)
     return ax
@@ -138,14 +136,14 @@ def _touches(execution: Execution, name: str) -> bool:
 
 
 def _spans(times, flags):
-    """Intervals of time in which a flag holds."""
+    """Return the intervals of time in which a flag is set."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     last = len(times) - 1
     return [(times[begin], times[min(end, last)]) for begin, end in edges.reshape(-1, 2)]
 
 
 def _colour(execution: Execution, name: str) -> str:
-    """The colour of a contact of the plan."""
+    """Return the colour of a contact of the plan."""
     styles = contact_styles(map(feature_pair, phase.contacts) for phase in execution.prediction.phases)
     return CONTACT_COLOURS[styles[name][0]]
 

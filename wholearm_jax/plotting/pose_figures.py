@@ -1,0 +1,100 @@
+"""Figures of poses: the hand and the object at one configuration, along a plan, and where a configuration can lead."""
+
+from __future__ import annotations
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Polygon as Patch
+
+from wholearm_jax.model import Scene, rigid_body
+from wholearm_jax.phases import Result, trajectory
+from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
+from wholearm_jax.plotting.style import FILL, INK, PAGE, PALE
+
+
+def plot_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbers: bool = False) -> Axes:
+    """The hand and the object at configuration `z` [m, rad]; `numbers` labels the vertices."""
+    ax = ax or plt.gca()
+    z = np.asarray(z)
+    outline = object_outline(scene, z)
+    joints, lengths, offsets = (np.asarray(a) for a in (scene.hand.joint, scene.hand.length, scene.hand.offset))
+    ax.plot(joints[::-1, 0], [0, 0], color=INK, lw=2.5, solid_capstyle="butt")
+    ax.add_patch(Patch(outline, closed=True, facecolor=FILL, edgecolor=INK, lw=1.0, joinstyle="round"))
+    for k, (joint, side) in enumerate(zip(joints, (1, -1), strict=True)):
+        direction = np.array([np.cos(z[3 + k]), np.sin(z[3 + k])])
+        base = joint + offsets[k] * side * np.array([-direction[1], direction[0]])
+        ends = np.stack([base, base + lengths[k] * direction])
+        ax.plot(*ends.T, color=COLOURS[k], lw=2.5, solid_capstyle="round")
+        ax.plot(*joint, "o", color=COLOURS[k], ms=4)
+    ax.plot(z[0], z[1], "+", color=INK, ms=5)
+    if numbers:
+        inward = z[:2] - outline
+        size = 0.3 * np.abs(inward).max()
+        for k, (x, y) in enumerate(outline + size * inward / np.hypot(*inward.T)[:, None]):
+            ax.text(x, y, str(k), ha="center", va="center", fontsize="x-small", color=INK, zorder=6)
+    ax.set_aspect("equal")
+    ax.axis("off")
+    ax.set_title(label)
+    return ax
+
+
+def plot_strip(result: Result, poses: int = 4, axes=None) -> np.ndarray:
+    """The plan as strips of poses (as the paper's figs. 2 and 3): one row a phase, time running to the right.
+
+    Takes and returns a `(phases, poses)` array of axes.
+    """
+    motions = trajectory(result)
+    axes = pose_grid(axes, max(len(motions), 1), poses, 0.95)
+    for row, (phase, motion) in enumerate(zip(result.phases, motions, strict=False)):
+        shown = np.linspace(0, len(motion.time) - 1, axes.shape[1]).round().astype(int)
+        for column, (ax, k) in enumerate(zip(axes[row], shown, strict=True)):
+            label = f"$t$ = {float(motion.time[k]):.2f} s"
+            plot_pose(result.scene, motion.z[k], ax, label=label, numbers=row == 0 and column == 0)
+        placement = {"transform": axes[row, 0].transAxes, "rotation": 90, "va": "center", "ha": "right"}
+        axes[row, 0].text(-0.04, 0.5, phase.name, style="italic", color=INK, **placement)
+    if not motions:
+        plot_pose(result.scene, result.scene.start, axes[0, 0], label=result.status.label)
+        for ax in axes[0, 1:]:
+            ax.axis("off")
+    return axes
+
+
+def plot_successors(scene: Scene, z, successors, columns: int = 4, axes=None) -> np.ndarray:
+    """The end of each phase that can follow configuration `z`, with the start in grey.
+
+    Shows the `successors` whose path could be traced. Takes and returns an array of axes, at least one for each.
+    """
+    shown = [s for s in successors if s.status.value == 0]
+    axes = pose_grid(axes, max(1, -(-len(shown) // columns)), columns, 1.15)
+    for ax in axes.flat:
+        ax.axis("off")
+    for ax, successor in zip(axes.flat, shown, strict=False):
+        _plot_start_outline(scene, z, ax)
+        rest = f"static {successor.static:.2f} N" if np.isfinite(successor.static) else "cannot be held"
+        contacts = " ".join(successor.contacts[:2]), " ".join(successor.contacts[2:])
+        label = "\n".join((*contacts, f"{successor.toward}: {successor.ends}", rest))
+        plot_pose(scene, successor.end, ax, label=label)
+        ax.title.set_fontsize("x-small")
+    return axes
+
+
+def pose_grid(axes, rows: int, columns: int, ratio: float) -> np.ndarray:
+    """Return `axes` as an array, or make new ones for poses; `ratio` is the height of each over its width."""
+    if axes is not None:
+        return np.asarray(axes)
+    size = (PAGE, PAGE / columns * ratio * rows)
+    return plt.subplots(rows, columns, figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained")[1]
+
+
+def object_outline(scene: Scene, z) -> np.ndarray:
+    """Return the object's vertices `(n, 2)` [m] in the world at configuration `z`."""
+    body = rigid_body(scene.object)
+    corners = np.asarray(body.vertices)[: int(body.count)]
+    c, s = np.cos(z[2]), np.sin(z[2])
+    return corners @ np.array([[c, s], [-s, c]]) + z[:2]
+
+
+def _plot_start_outline(scene: Scene, z, ax: Axes) -> None:
+    """Plot the object's outline at `z`, pale."""
+    ax.add_patch(Patch(object_outline(scene, z), closed=True, facecolor="none", edgecolor=PALE, lw=0.8, ls=":"))
