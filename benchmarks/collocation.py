@@ -35,7 +35,7 @@ from scipy.special import beta, betainc
 import wholearm_jax as wa
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.margin import best_quasistatic_torque_batch
-from wholearm_jax.model import pad_schedule
+from wholearm_jax.model import Arrival, pad_schedule
 from wholearm_jax.phases import simulate_phase
 from wholearm_jax.simulation import IntegratorOptions
 
@@ -490,7 +490,7 @@ def _collected(dynamics: PathDynamics, phase: Phase, solves: list[Solve]) -> Col
     torque = best.course.tau * phase.path.limit
     schedule = pad_schedule(wa.torque_schedule(np.linspace(0, phase.duration, phase.knots), torque))
     outcome = simulate_phase(
-        dynamics, schedule, jnp.zeros(()), jnp.asarray(phase.duration), IntegratorOptions(), "rest"
+        dynamics, schedule, jnp.zeros(()), jnp.asarray(phase.duration), IntegratorOptions(), Arrival.AT_REST
     )
     last = int(outcome.motion.count)
     return Collocated(

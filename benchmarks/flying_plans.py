@@ -20,7 +20,7 @@ from random_plans import _grasps, random_object, write
 
 import wholearm_jax as wa
 from wholearm_jax.files import to_dict
-from wholearm_jax.model import Phase, contact_formation, path_target
+from wholearm_jax.model import Arrival, Phase, contact_formation, path_target
 from wholearm_jax.planning import Successor, exit_velocity, successor_formations
 
 SHORTEST, LEAST_BOUND, SLOWED = 0.2, 0.2, 0.2  # wire [object radii], bound [N], speed after an impact over that before
@@ -72,7 +72,7 @@ def chains(scene: wa.Scene, z, depth: int, z_dot=None) -> Iterator[tuple[Success
 
 
 def _phase(number: int, way: Successor, duration: float, last: bool) -> Phase:
-    arrive = "rest" if last else "moving"
+    arrive = Arrival.AT_REST if last else Arrival.MOVING
     return Phase(
         f"phase {number}", contact_formation(way.contacts), path_target(way.toward), jnp.asarray(duration), arrive
     )
@@ -88,7 +88,7 @@ def main() -> None:
     given = parser.parse_args()
     scenes = flying_plans(given.count, given.seed, phases=given.phases)
     for scene in scenes:
-        print(scene.title, [(p.formation.names, p.arrive) for p in scene.phases])
+        print(scene.title, [(p.formation.names, p.arrive.name) for p in scene.phases])
     if given.out is not None:
         write(scenes, given.out)
 

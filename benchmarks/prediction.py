@@ -51,7 +51,7 @@ from wholearm_jax.ensembles import wilson_interval
 from wholearm_jax.execution import CONVEX, ContactCompliance, ExecutionOutcome, Tolerance, execute, touching_contacts_at
 from wholearm_jax.files import to_dict
 from wholearm_jax.margin import affine_coefficients
-from wholearm_jax.model import pad_schedule
+from wholearm_jax.model import Arrival, pad_schedule
 from wholearm_jax.phases import Result, sample_phase, target_configuration
 from wholearm_jax.plotting import LINK_COLOURS as COLOURS
 
@@ -134,7 +134,7 @@ def predict(scene: wa.Scene, torque: wa.TorqueSchedule, traced) -> Predicted:
 
 def _rests(phase) -> bool:
     """Whether a phase only holds the object."""
-    return phase.arrive == "hold"
+    return phase.arrive is Arrival.HOLD
 
 
 def _dip(phase, course) -> float:
@@ -205,7 +205,7 @@ def _arrives(phase, course, last: bool) -> bool | None:
     there = off <= 1
     if _rests(phase):
         return there and phase.status in (Status.OK, Status.CONTACT_LOST)
-    passes = phase.arrive == "moving"
+    passes = phase.arrive is Arrival.MOVING
     if not last and off > PASSED and (there or (passes and ended is Status.OK)):
         return None
     if passes:
@@ -249,7 +249,7 @@ def spoiled(base: Predicted, rng: np.random.Generator) -> tuple[str, wa.TorqueSc
 def _rows(result: Result) -> np.ndarray:
     """The phase that each row of a schedule belongs to, by when its phases begin."""
     times = np.asarray(result.torque.times)
-    if all(phase.arrive != "moving" for phase in result.phases):
+    if all(phase.arrive is not Arrival.MOVING for phase in result.phases):
         return np.arange(len(times)) // KNOTS
     return np.searchsorted([phase.start for phase in result.phases], times, side="right") - 1
 
@@ -298,7 +298,7 @@ def executed(
             longest = _longest(judged & ~closed[:, done.names.index(name)]) * done.timestep
             if longest > free:
                 free, which = longest, name
-        if phase.arrive == "rest":
+        if phase.arrive is Arrival.AT_REST:
             off = max(off, _apart(_at(done.course, phase.start + float(phase.duration)), phase))
     holds = done.ending is ExecutionOutcome.OK and free < FREE and off <= 1
     errors = {"position_error": done.position_error, "angle_error": abs(done.angle_error), "off": off}

@@ -46,6 +46,7 @@ from wholearm_jax.core import CachedJit, Status
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.files import scene_toml as scene_file
 from wholearm_jax.model import (
+    Arrival,
     PhaseSchedule,
     TorqueSchedule,
     pad_schedule,
@@ -120,7 +121,7 @@ def _problem(scene, traced, phase, kind, unreduced, referred) -> Problem:
     start, duration = jnp.asarray(float(phase)), jnp.asarray(float(scene.phases[phase].duration))
     schedule = pad_schedule(given)
     outcome = simulate_phase(
-        traced[phase].dynamics, schedule, start, duration, IntegratorOptions(tolerance=1e-13), "moving"
+        traced[phase].dynamics, schedule, start, duration, IntegratorOptions(tolerance=1e-13), Arrival.MOVING
     )
     assert not bool(outcome.motion.at_rest[0]), "the references do not wait"
     end = float(outcome.motion.phase_time[int(outcome.motion.count)])
@@ -221,13 +222,13 @@ def package(problem: Problem, solver: str, tolerance: float):
 
     def again():
         traced = trace_phase(solid, scene.hand, scene.gravity, phase.formation, rough, phase.target)
-        return simulate_phase(traced.dynamics, *here, options, "moving")
+        return simulate_phase(traced.dynamics, *here, options, Arrival.MOVING)
 
     durations = _durations(problem, MANY)
     calls = {
         "package": Call(lambda: _move(dynamics, problem.phase_schedule, problem.duration, options)),
         "package, within a program": Call(lambda: _moves(dynamics, problem.phase_schedule, durations, options), MANY),
-        "package, run": Call(lambda: simulate_phase(dynamics, *here, options, "moving")),
+        "package, run": Call(lambda: simulate_phase(dynamics, *here, options, Arrival.MOVING)),
         "package, trace and run": Call(again),
     }
     return error(problem, *rows), count, calls

@@ -23,6 +23,7 @@ from wholearm_jax.margin import (
     minimum_margin,
 )
 from wholearm_jax.model import (
+    Arrival,
     ContactFormation,
     Hand,
     PathTarget,
@@ -34,7 +35,7 @@ from wholearm_jax.model import (
     scaled_mechanics,
     torque_at,
 )
-from wholearm_jax.phases import GOALS, assess_phase
+from wholearm_jax.phases import assess_phase
 from wholearm_jax.simulation import IntegratorOptions, path_acceleration, simulate_motion
 from wholearm_jax.tracing import ContactPath, Resolution, trace_path
 
@@ -120,7 +121,7 @@ def follow(path: ContactPath, dynamics: PathDynamics, scene: Scenes, options: In
     found = minimum_margin(dynamics, phase_schedule, scene.duration, motion, options)
     entered = resolve_impact(dynamics, jnp.zeros_like(scene.rough))
     verdict, moving = (
-        assess_phase(dynamics, motion, found, goal, entered) for goal in (GOALS["rest"], GOALS["moving"])
+        assess_phase(dynamics, motion, found, goal, entered) for goal in (Arrival.AT_REST, Arrival.MOVING)
     )
     end, s, w = (values[motion.count] for values in (motion.phase_time, motion.s, motion.w))
     steps = dense_output(dynamics, phase_schedule, scene.duration, motion)

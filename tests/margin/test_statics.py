@@ -12,7 +12,7 @@ from wholearm_jax.files.results import summary
 from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.margin.quasistatic import best_quasistatic_torque
 from wholearm_jax.margin.statics import contact_statics, rest_margin
-from wholearm_jax.model.scene import replace_duration
+from wholearm_jax.model.scene import Arrival, replace_duration
 from wholearm_jax.model.schedule import pad_schedule
 from wholearm_jax.optimisation.rest_transition import RestTransition, holding_schedule
 from wholearm_jax.phases.phase_ends import statics_at_start
@@ -183,7 +183,7 @@ def test_slide_hold_flip(slide_hold_flip, optimised):
     course = wa.trajectory(optimised.result)[1]
     np.testing.assert_array_equal(course.z, np.broadcast_to(course.z[0], course.z.shape))
     assert np.isnan(course.cn).all()
-    assert wa.parse(to_dict(scene)).phases[1].arrive == "hold"
+    assert wa.parse(to_dict(scene)).phases[1].arrive is Arrival.HOLD
     content = summary(optimised.result)
     assert content["hold_margin"] == content["phases"][1]["holds"][0]["margin"] == pause.margin
     quasistatic = wa.simulate(scene, wa.quasistatic(scene, traced=traced), traced=traced)
@@ -207,7 +207,7 @@ def test_an_object_is_held_where_its_wire_ends(optimised, length):
     breaks = dynamics.breakpoints.at[1:].set(dynamics.breakpoints[0] + length)
     dynamics = eqx.tree_at(lambda t: t.breakpoints, dynamics, breaks)
     found = simulate_phase(
-        dynamics, pad_schedule(optimised.torque), pause.start, pause.duration, IntegratorOptions(), "hold"
+        dynamics, pad_schedule(optimised.torque), pause.start, pause.duration, IntegratorOptions(), Arrival.HOLD
     )
     motion = found.motion
     assert wa.Status(int(motion.status)) is wa.Status.STUCK

@@ -12,6 +12,7 @@ from scipy.optimize import linprog
 import wholearm_jax as wa
 from wholearm_jax.margin import quasistatic as squeeze
 from wholearm_jax.margin.quasistatic import BOUND_PLACES, BOUND_SPEEDS, MAX_SPEED_RATIO
+from wholearm_jax.model import Arrival
 
 coefficients, bound, hold = (
     jax.jit(squeeze.affine_coefficients),
@@ -77,7 +78,7 @@ def test_bounds_leave_out_only_what_cannot_roll(name, grip):
     scene = eqx.tree_at(lambda s: s.object.friction, scene, grip * scene.object.friction)
     traced = wa.trace(scene)
     for at, phase, top in zip(traced, scene.phases, wa.bounds(scene, traced=traced), strict=True):
-        every = bound(at.dynamics, phase.duration, True, phase.arrive == "rest")
+        every = bound(at.dynamics, phase.duration, True, phase.arrive is Arrival.AT_REST)
         assert float(top.value) == pytest.approx(float(every.value), rel=1e-12)
 
 

@@ -8,7 +8,8 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax.dynamics.path_dynamics import Impact
 from wholearm_jax.margin.contact_forces import MarginResult
-from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, DEFAULT_ARRIVAL, GOALS, IMPULSE_ROUNDING, assess_phase
+from wholearm_jax.model import Arrival
+from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, DEFAULT_ARRIVAL, IMPULSE_ROUNDING, assess_phase
 from wholearm_jax.simulation.phase_motion import Motion
 
 S = wa.Status
@@ -47,8 +48,8 @@ def scored(lost=np.inf, contact=-1):
     return MarginResult(**{name: jnp.asarray(value) for name, value in numbers.items()})
 
 
-def judged(dynamics, motion, goal="rest", margin_result=None, impact=CALM, arrival=DEFAULT_ARRIVAL):
-    found = assess_phase(dynamics, motion, margin_result or scored(), jnp.asarray(GOALS[goal]), impact, arrival)
+def judged(dynamics, motion, goal=Arrival.AT_REST, margin_result=None, impact=CALM, arrival=DEFAULT_ARRIVAL):
+    found = assess_phase(dynamics, motion, margin_result or scored(), jnp.asarray(int(goal)), impact, arrival)
     return S(int(found.status)), float(found.phase_time), int(found.contact)
 
 
@@ -65,7 +66,7 @@ def test_at_rest_at_the_end_means_near_and_slow(dynamics, ended, near, slow, arr
     assert np.sqrt(ARRIVAL_SPEED_FACTOR * arrival) == pytest.approx(np.sqrt(2 * 6 * arrival))
 
 
-@pytest.mark.parametrize("goal", ["moving", "caught"])
+@pytest.mark.parametrize("goal", [Arrival.MOVING, Arrival.ANY_SPEED])
 @pytest.mark.parametrize("ended", [S.OK, S.LEFT_FORMATION])
 def test_where_any_speed_will_do(dynamics, ended, goal):
     assert judged(dynamics, moved(dynamics, ended, speed=5.0, phase_time=0.7), goal)[0] is S.OK
@@ -91,22 +92,22 @@ def test_what_turns_back_has_arrived_if_it_was_late(dynamics):
 
 def test_holds_are_broken_by_departing(dynamics):
     stays = moved(dynamics, S.STUCK, rests=1.0)
-    assert judged(dynamics, stays, "hold") == (S.OK, 1.0, -1)
+    assert judged(dynamics, stays, Arrival.HOLD) == (S.OK, 1.0, -1)
     forward = moved(dynamics, S.OK, rests=0.3)
-    assert judged(dynamics, forward, "hold") == (S.NOT_REACHED, 0.3, -1)
+    assert judged(dynamics, forward, Arrival.HOLD) == (S.NOT_REACHED, 0.3, -1)
     backward = moved(dynamics, S.REVERSED, rests=0.3, phase_time=0.3)
-    assert judged(dynamics, backward, "hold") == (S.REVERSED, 0.3, -1)
+    assert judged(dynamics, backward, Arrival.HOLD) == (S.REVERSED, 0.3, -1)
     later = moved(dynamics, S.REVERSED, rests=0.3, phase_time=0.6)
-    assert judged(dynamics, later, "hold") == (S.NOT_REACHED, 0.3, -1), "it set out forward first"
+    assert judged(dynamics, later, Arrival.HOLD) == (S.NOT_REACHED, 0.3, -1), "it set out forward first"
     at_once = moved(dynamics, S.OK)
-    assert judged(dynamics, at_once, "hold") == (S.NOT_REACHED, 0.0, -1)
+    assert judged(dynamics, at_once, Arrival.HOLD) == (S.NOT_REACHED, 0.0, -1)
 
 
 def test_a_tensile_force_counts_before_how_the_motion_ends(dynamics):
     for ended in (S.OK, S.LEFT_FORMATION, S.STUCK, S.REVERSED, S.MAX_STEPS):
         assert judged(dynamics, moved(dynamics, ended), margin_result=scored(0.4, 2)) == (S.CONTACT_LOST, 0.4, 2)
     held = moved(dynamics, S.STUCK, rests=1.0)
-    assert judged(dynamics, held, "hold", scored(0.4, 2)) == (S.OK, 1.0, -1), "forces at rest are not determined"
+    assert judged(dynamics, held, Arrival.HOLD, scored(0.4, 2)) == (S.OK, 1.0, -1), "forces at rest are not determined"
 
 
 SIZE = 3.0

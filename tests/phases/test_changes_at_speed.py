@@ -10,8 +10,8 @@ import wholearm_jax as wa
 from wholearm_jax.dynamics.path_dynamics import evaluate, locate_panel, resolve_impact
 from wholearm_jax.model.kinematics import normal_jacobian, tangential_jacobian
 from wholearm_jax.model.mechanics import scaled_mechanics
+from wholearm_jax.model.scene import Arrival, rigid_body
 from wholearm_jax.model.scene import path_target as wa_heading
-from wholearm_jax.model.scene import rigid_body
 from wholearm_jax.optimisation.optimiser import MIN_TRANSITION_SPEED
 from wholearm_jax.phases import has_torque_jumps, simulate_phases
 from wholearm_jax.phases.phase_ends import start_configuration
@@ -125,7 +125,7 @@ def test_a_change_that_would_throw_the_object_back_is_refused_by_name():
 
 
 def _flying(phase):
-    return type(phase)(phase.name, phase.formation, phase.target, phase.duration, arrive="moving")
+    return type(phase)(phase.name, phase.formation, phase.target, phase.duration, arrive=Arrival.MOVING)
 
 
 @pytest.mark.parametrize("x", [0.0, -0.01, -0.015, -0.018])
@@ -138,7 +138,7 @@ def test_a_motion_cut_in_two_goes_on_as_it_was(x):
     def pushed(*untils):
         headings = [slide.target if u is None else wa_heading("x-", {"x": u}) for u in untils]
         duration = jnp.asarray(1.2 / len(untils))
-        parts = [type(slide)("slide", slide.formation, h, duration, arrive="moving") for h in headings]
+        parts = [type(slide)("slide", slide.formation, h, duration, arrive=Arrival.MOVING) for h in headings]
         return wa.simulate(eqx.tree_at(lambda s: s.phases, scene, tuple(parts)), torque)
 
     whole, cut = pushed(None), pushed(x, None)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.model.scene import replace_duration
+from wholearm_jax.model.scene import Arrival, replace_duration
 from wholearm_jax.phases.sampling import Trajectory
 
 SAMPLES = 401
@@ -53,10 +53,10 @@ def test_phases_that_pass_on_at_speed_are_sampled_until_they_do():
     courses = wa.trajectory(result, SAMPLES)
     for phase, course in zip(result.phases, courses, strict=True):
         assert_moves_as_it_says(course)
-        end = phase.time if phase.arrive == "moving" else phase.start + phase.duration
+        end = phase.time if phase.arrive is Arrival.MOVING else phase.start + phase.duration
         assert course.time[-1] == pytest.approx(end)
     for before, after, phase in zip(courses, courses[1:], result.phases, strict=False):
-        assert phase.arrive == "moving"
+        assert phase.arrive is Arrival.MOVING
         assert after.time[0] == pytest.approx(before.time[-1])
         np.testing.assert_allclose(after.z[0], before.z[-1], atol=1e-8)
         np.testing.assert_allclose(phase.outcome.exit_velocity, before.z_dot[-1], rtol=1e-8, atol=1e-10)

@@ -13,6 +13,7 @@ import wholearm_jax
 from tests.reference import unreduced
 from wholearm_jax.files import scene_toml as scene_file
 from wholearm_jax.margin import quasistatic as squeeze
+from wholearm_jax.model import Arrival
 from wholearm_jax.phases.phase_ends import configuration, start_configuration
 from wholearm_jax.phases.phase_simulation import simulate_phase
 from wholearm_jax.phases.sampling import sample_phase
@@ -54,7 +55,9 @@ def compared(name, phase, tolerance, samples):
     scene = SCENES[name]()
     dynamics = wholearm_jax.trace(scene)[phase].dynamics
     torque, start, length = passing(dynamics), jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = simulate_phase(dynamics, torque, start, length, IntegratorOptions(tolerance=tolerance), "moving").motion
+    motion = simulate_phase(
+        dynamics, torque, start, length, IntegratorOptions(tolerance=tolerance), Arrival.MOVING
+    ).motion
     steps = np.asarray(motion.phase_time)[: int(motion.count) + 1]
     assert int(motion.status) == wholearm_jax.Status.LEFT_FORMATION
     assert 0.5 < steps[-1] < 1.0
@@ -118,7 +121,9 @@ def test_the_moment_of_a_loss(name, phase):
 
     def outcome(amount):
         weaker = wholearm_jax.TorqueSchedule(torque.times, torque.values.at[knot].add(amount * along))
-        return weaker, simulate_phase(dynamics, weaker, 0.0, DURATION, IntegratorOptions(tolerance=1e-12), "caught")
+        return weaker, simulate_phase(
+            dynamics, weaker, 0.0, DURATION, IntegratorOptions(tolerance=1e-12), Arrival.ANY_SPEED
+        )
 
     weaker, found = max(
         (outcome(amount) for amount in (-1.5, 1.5)), key=lambda one: np.isfinite(one[1].margin_result.loss_time)
@@ -175,7 +180,7 @@ def test_start_after_waiting(name, phase):
     times = np.concatenate([[0.0], delay + np.asarray(later.times)])
     values = np.concatenate([[held.torque], np.asarray(later.values)])
     torque, start, length = wholearm_jax.torque_schedule(times, values), jnp.asarray(0.0), jnp.asarray(times[-1])
-    motion = simulate_phase(dynamics, torque, start, length, IntegratorOptions(tolerance=1e-12), "moving").motion
+    motion = simulate_phase(dynamics, torque, start, length, IntegratorOptions(tolerance=1e-12), Arrival.MOVING).motion
     assert bool(motion.at_rest[0])
     steps = np.asarray(motion.phase_time)[: int(motion.count) + 1]
     assert np.all(np.diff(steps) >= 0)
@@ -219,7 +224,12 @@ def test_which_way_an_object_at_rest_sets_out(name, phase):
         torque = rng.uniform(-1.0, 1.0, 2)
         ahead, behind = (model.solve(begin, still, torque, side * signs)[0] @ way for side in (1, -1))
         motion = simulate_phase(
-            dynamics, wholearm_jax.torque_schedule([0.0, 1.0], [torque] * 2), 0.0, 1.0, IntegratorOptions(), "moving"
+            dynamics,
+            wholearm_jax.torque_schedule([0.0, 1.0], [torque] * 2),
+            0.0,
+            1.0,
+            IntegratorOptions(),
+            Arrival.MOVING,
         ).motion
         waits, status = bool(motion.at_rest[0]), wholearm_jax.Status(int(motion.status))
         moves = int(motion.count) > 0 and not waits

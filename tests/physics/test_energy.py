@@ -7,7 +7,7 @@ from support import DURATION, passing
 
 import wholearm_jax
 from wholearm_jax.model.kinematics import contact_set, tangential_jacobian
-from wholearm_jax.model.scene import rigid_body
+from wholearm_jax.model.scene import Arrival, rigid_body
 from wholearm_jax.phases.phase_simulation import simulate_phase
 from wholearm_jax.phases.sampling import sample_phase
 from wholearm_jax.simulation.integrator import IntegratorOptions
@@ -25,7 +25,7 @@ def test_balance(name, phase):
     dynamics = wholearm_jax.trace(scene)[phase].dynamics
     torque, start, length = passing(dynamics), jnp.asarray(0.0), jnp.asarray(DURATION)
     motion = simulate_phase(
-        dynamics, torque, start, length, IntegratorOptions(tolerance=1e-13, max_steps=512), "moving"
+        dynamics, torque, start, length, IntegratorOptions(tolerance=1e-13, max_steps=512), Arrival.MOVING
     ).motion
     ends = np.asarray(motion.phase_time)[: int(motion.count) + 1]
     x, weight = np.polynomial.legendre.leggauss(NODES)

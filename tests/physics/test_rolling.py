@@ -21,7 +21,7 @@ from wholearm_jax.model.kinematics import (
     contact_set,
     tangential_jacobian,
 )
-from wholearm_jax.model.scene import contact_formation, rigid_body
+from wholearm_jax.model.scene import Arrival, contact_formation, rigid_body
 from wholearm_jax.model.schedule import TorqueSchedule
 from wholearm_jax.phases.phase_simulation import simulate_phase
 from wholearm_jax.phases.sampling import sample_phase
@@ -125,7 +125,7 @@ def test_against_unreduced(rolling):
     """Motion and all forces of a passage against the independent simulation of five coordinates."""
     data, traced, torque = rolling
     dynamics, start, length = traced.dynamics, jnp.asarray(0.0), jnp.asarray(DURATION)
-    motion = simulate_phase(dynamics, torque, start, length, IntegratorOptions(tolerance=1e-13), "moving").motion
+    motion = simulate_phase(dynamics, torque, start, length, IntegratorOptions(tolerance=1e-13), Arrival.MOVING).motion
     assert int(motion.status) == wholearm_jax.Status.LEFT_FORMATION
     end = float(motion.phase_time[motion.count]) * (1 - 1e-12)
     steps = np.asarray(motion.phase_time)[: int(motion.count)]
@@ -164,7 +164,7 @@ def test_energy(rolling):
     scene, dynamics = wholearm_jax.parse(data), traced.dynamics
     start, length = jnp.asarray(0.0), jnp.asarray(DURATION)
     motion = simulate_phase(
-        dynamics, torque, start, length, IntegratorOptions(tolerance=1e-13, max_steps=512), "moving"
+        dynamics, torque, start, length, IntegratorOptions(tolerance=1e-13, max_steps=512), Arrival.MOVING
     ).motion
     ends = np.asarray(motion.phase_time)[: int(motion.count) + 1]
     x, weight = np.polynomial.legendre.leggauss(8)

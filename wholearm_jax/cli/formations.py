@@ -7,6 +7,7 @@ import typer
 
 from wholearm_jax.cli.arguments import BadInput, SceneName, load_scene, make_output_folder, phase_number
 from wholearm_jax.cli.prediction import trace_or_exit
+from wholearm_jax.model import Arrival
 
 LEGEND = """length: of the wire, in object radii; '-' and a status where none can be followed
 static, bound: the best least contact force [N] with the object at rest there, and in a phase of 1 s
@@ -46,7 +47,7 @@ def _configuration(scene, traced, after: str | None):
         names = ", ".join(p.name for p in scene.phases)
         raise BadInput(f"--after {after}: no such phase; phases: {names}")
     z = target_configuration(scene.phases[row], traced[row])
-    return z, None if scene.phases[row].arrive == "hold" else exit_velocity(traced[row].dynamics)
+    return z, None if scene.phases[row].arrive is Arrival.HOLD else exit_velocity(traced[row].dynamics)
 
 
 def _print_table(scene, z, successors) -> None:

@@ -14,7 +14,7 @@ from wholearm_jax.core import CachedJit, Status
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.ensembles.ensemble import Ensemble
 from wholearm_jax.margin import log_barrier_minimum
-from wholearm_jax.model import Scene, TorqueSchedule, pad_schedule, rigid_body, scaled_mechanics
+from wholearm_jax.model import Arrival, Scene, TorqueSchedule, pad_schedule, rigid_body, scaled_mechanics
 from wholearm_jax.phases import (
     ARRIVAL_SPEED_FACTOR,
     SimulatedPhase,
@@ -99,10 +99,10 @@ def _certify_rests(
     return jnp.stack(certified).all()
 
 
-def _arrival_penalty(simulated: SimulatedPhase, dynamics: PathDynamics, arrive: str, arrival):
+def _arrival_penalty(simulated: SimulatedPhase, dynamics: PathDynamics, arrive: Arrival, arrival):
     """Penalise the distance and speed with which a phase misses its end; logarithmic, lest the worst sample rule."""
     last = simulated.motion.count
     misses = [jnp.abs(dynamics.breakpoints[-1] - simulated.motion.s[last]) / dynamics.length / arrival]
-    if arrive == "rest":
+    if arrive is Arrival.AT_REST:
         misses.append(simulated.motion.w[last] / dynamics.length / jnp.sqrt(ARRIVAL_SPEED_FACTOR * arrival))
     return sum(jnp.log1p(jnp.maximum(miss - FREE_FRACTION, 0.0) ** 2) for miss in misses)

@@ -26,6 +26,7 @@ from wholearm_jax.core import Status, require_positive
 from wholearm_jax.execution.coulomb_friction import advance
 from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
 from wholearm_jax.model import (
+    Arrival,
     ContactFormation,
     Hand,
     RigidBody,
@@ -204,7 +205,7 @@ def start_of(prediction: Result) -> Float[np.ndarray, "5"]:
 def target_of(prediction: Result) -> Float[np.ndarray, "5"]:
     """Where the plan ends: its last phase's destination, or the predicted end where it need not stand still there."""
     last = prediction.phases[-1]
-    moving = last.arrive in ("moving", "caught") and prediction.status is Status.OK
+    moving = last.arrive in (Arrival.MOVING, Arrival.ANY_SPEED) and prediction.status is Status.OK
     end = (
         trajectory(prediction, 2)[-1].z[-1]
         if moving

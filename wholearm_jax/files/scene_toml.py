@@ -25,6 +25,7 @@ from wholearm_jax.core import SceneError, as_device_array, write_atomically
 from wholearm_jax.model import (
     COORDINATES,
     LINKS,
+    Arrival,
     Hand,
     Phase,
     Scene,
@@ -36,6 +37,8 @@ from wholearm_jax.model import (
 )
 
 CONSTRAINTS = 4
+ARRIVALS = {"rest": Arrival.AT_REST, "moving": Arrival.MOVING, "caught": Arrival.ANY_SPEED}
+"""Words for `arrive`."""
 
 
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -245,15 +248,11 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
                 contact_formation(p.contacts),
                 path_target(p.toward, p.until),
                 as_device_array(p.duration, float),
-                _arrive(p),
+                Arrival.HOLD if p.hold else ARRIVALS[p.arrive or "rest"],
             )
             for p in checked.phase
         ),
     )
-
-
-def _arrive(phase: _Phase) -> str:
-    return "hold" if phase.hold else phase.arrive or "rest"
 
 
 _WORDS = {
@@ -326,7 +325,7 @@ def to_dict(scene: Scene) -> dict[str, Any]:
 def _phase_dict(phase: Phase) -> dict[str, Any]:
     way = phase.target
     row: dict[str, Any] = {"name": phase.name, "contacts": list(phase.formation.names)}
-    if phase.arrive == "hold":
+    if phase.arrive is Arrival.HOLD:
         return row | {"hold": True, "duration": float(phase.duration)}
     if int(way.coordinate) < 0:
         raise ValueError(f"phase '{phase.name}' does not say which way it heads: give it a heading such as 'x-'")
@@ -336,7 +335,8 @@ def _phase_dict(phase: Phase) -> dict[str, Any]:
     }
     if int(way.until_coordinate) >= 0:
         row["until"] = {COORDINATES[int(way.until_coordinate)]: float(way.until_value)}
-    return row | ({"arrive": phase.arrive} if phase.arrive != "rest" else {})
+    word = next(word for word, arrival in ARRIVALS.items() if arrival is phase.arrive)
+    return row | ({} if phase.arrive is Arrival.AT_REST else {"arrive": word})
 
 
 def save(scene: Scene, path: str | Path) -> None:

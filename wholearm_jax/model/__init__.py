@@ -29,6 +29,7 @@ from wholearm_jax.model.scene import (
     EDGE,
     LINKS,
     VERTEX,
+    Arrival,
     ContactFormation,
     Hand,
     PathTarget,

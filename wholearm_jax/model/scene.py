@@ -5,6 +5,7 @@ one; `theta` is measured anticlockwise from `+x`. The object's frame sits at its
 given vertices.
 """
 
+import enum
 import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -111,19 +112,23 @@ class PathTarget(eqx.Module):
     until_value: Float[Array, ""]
 
 
-class Phase(eqx.Module):
-    """One contact formation held for a while.
+class Arrival(enum.IntEnum):
+    """How a phase must end, in scene files `arrive` and `hold`; the numbers travel through compiled programs."""
 
-    `arrive` is `"rest"` (the object must be at rest at the end), `"moving"` (the next phase takes over at speed, by an
-    inelastic impact), `"caught"` (any speed will do, and is lost before the next phase) or `"hold"` (the object must
-    stay where the phase begins, and its heading means nothing).
-    """
+    MOVING = 0  # at its path's end; the next phase takes over at speed, by an inelastic impact
+    AT_REST = 1  # at its path's end, without speed
+    HOLD = 2  # where it begins: the object stays, and the phase's target means nothing
+    ANY_SPEED = 3  # at its path's end, and any speed is lost before the next phase
+
+
+class Phase(eqx.Module):
+    """One contact formation, the direction of travel, the time [s] that it may take, and how it must end."""
 
     name: str = eqx.field(static=True)
     formation: ContactFormation
     target: PathTarget
     duration: Float[Array, ""]
-    arrive: str = eqx.field(static=True, default="rest")
+    arrive: Arrival = eqx.field(static=True, default=Arrival.AT_REST)
 
 
 class Scene(eqx.Module):

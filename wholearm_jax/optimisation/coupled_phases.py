@@ -18,7 +18,15 @@ import optax
 
 from wholearm_jax.core import Status, as_device_array, stack_trees
 from wholearm_jax.margin import MarginBound
-from wholearm_jax.model import Phase, Scene, TorqueSchedule, concatenate_schedules, pad_schedule, uniform_schedule
+from wholearm_jax.model import (
+    Arrival,
+    Phase,
+    Scene,
+    TorqueSchedule,
+    concatenate_schedules,
+    pad_schedule,
+    uniform_schedule,
+)
 from wholearm_jax.optimisation.constraints import Limits
 from wholearm_jax.optimisation.initial_guess import initial_guesses
 from wholearm_jax.optimisation.interior_point import interior_point
@@ -164,7 +172,7 @@ def _verify_by_simulation(scene: Scene, group: CoupledPhases, p: Variables) -> t
     for phase, at, end, top in zip(group.phases, group.traced, ends, group.bounds, strict=True):
         one = simulate_phase(at.dynamics, schedule, start, end - start, options, phase.arrive, incoming_velocity)
         start += float(one.duration) * float(np.asarray(one.motion.phase_time)[int(one.motion.count)])
-        incoming_velocity = one.exit_velocity if phase.arrive == "moving" else None
+        incoming_velocity = one.exit_velocity if phase.arrive is Arrival.MOVING else None
         held = rest_intervals(scene, torque, phase, at, one)
         fine.append(int(one.assessment.status) == Status.OK and all(h.loss_time is None for h in held))
         shares.append(float(one.margin_result.margin) / top)

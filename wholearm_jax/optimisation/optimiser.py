@@ -32,6 +32,7 @@ from wholearm_jax.core import (
 from wholearm_jax.dynamics import placeholder_dynamics
 from wholearm_jax.margin import MarginBound, margin_upper_bound
 from wholearm_jax.model import (
+    Arrival,
     Phase,
     Scene,
     TorqueSchedule,
@@ -110,7 +111,7 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[TracedPhase, ...
     traced = traced or trace(scene)
 
     def torques(at, phase):
-        if phase.arrive == "hold":
+        if phase.arrive is Arrival.HOLD:
             return holding_schedule(scene, phase, at, knots)
         start = initial_guesses([at.dynamics], [float(phase.duration)], knots, 1.0)[0]
         return uniform_schedule(float(phase.duration), at.dynamics.torque_limit * start.torque[0])
@@ -131,14 +132,14 @@ def bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[Margi
     ['0.966 N', '0.838 N']
     """
     traced = traced or trace(scene)
-    begins = [True, *(p.arrive != "moving" for p in scene.phases[:-1])]
+    begins = [True, *(p.arrive is not Arrival.MOVING for p in scene.phases[:-1])]
     rows = zip(traced, scene.phases, begins, strict=True)
 
     def top(at, phase, begin):
         if int(at.dynamics.status) != Status.OK:
             return MarginBound(jnp.asarray(-np.inf), at.dynamics.breakpoints[0], jnp.zeros(()))
-        if phase.arrive != "hold":
-            told = as_device_array(begin), as_device_array(phase.arrive == "rest"), _rolling(phase)
+        if phase.arrive is not Arrival.HOLD:
+            told = as_device_array(begin), as_device_array(phase.arrive is Arrival.AT_REST), _rolling(phase)
             return _bound(at.dynamics, phase.duration, *told)
         balance, departure = statics_at_start(scene, phase, at)
         return MarginBound(jnp.asarray(balance.best(departure).margin), at.dynamics.breakpoints[0], jnp.zeros(()))
@@ -249,7 +250,7 @@ def _part(
 ) -> tuple[list[TorqueSchedule], str, list[IterationRecord]]:
     """One group of phases, given how it takes over and hands over: schedules, why their descent stopped, its steps."""
     phases, (begin, end) = tuple(scene.phases[k] for k in group), ends
-    if phases[0].arrive == "hold":
+    if phases[0].arrive is Arrival.HOLD:
         held = holding_schedule(scene, phases[0], traced[group[0]], wanted.knots, wanted.rate_limit, begin, end)
         return [held], "the best torque of a linear programme", []
     paths, most = [traced[k] for k in group], [tops[k] for k in group]
@@ -269,7 +270,7 @@ def _in_turn_called(callback: Callable[[IterationRecord], None]) -> Callable[[It
 
 def _lasting(scene: Scene, duration: float) -> Scene:
     """The same plan, but for the duration of all phases that move the object."""
-    phases = (p if p.arrive == "hold" else replace_duration(p, duration) for p in scene.phases)
+    phases = (p if p.arrive is Arrival.HOLD else replace_duration(p, duration) for p in scene.phases)
     return eqx.tree_at(lambda s: s.phases, scene, tuple(phases))
 
 
@@ -277,8 +278,8 @@ def precompile_optimise(
     scene: Scene, *, knots: int = 51, optimiser: optax.GradientTransformation | None = None
 ) -> tuple[BackgroundTask, ...]:
     """Compile what `optimise` runs in a thread of its own, while wires are traced; it is to be waited for."""
-    sizes = sorted({len(group) for group in _groups(scene) if scene.phases[group[0]].arrive != "hold"})
-    rolling = sorted({_rolling(p) for p in scene.phases if p.arrive != "hold"})
+    sizes = sorted({len(group) for group in _groups(scene) if scene.phases[group[0]].arrive is not Arrival.HOLD})
+    rolling = sorted({_rolling(p) for p in scene.phases if p.arrive is not Arrival.HOLD})
     squeezes = compile_in_background(_squeeze_blank, tuple(sizes), tuple(rolling), knots)
     descents = [compile_in_background(_advance_blank, n, knots, optimiser) for n in sizes]
     return (
@@ -300,7 +301,7 @@ def _groups(scene: Scene) -> list[list[int]]:
     groups, fresh = [], True
     for index, phase in enumerate(scene.phases):
         groups = [*groups, [index]] if fresh else [*groups[:-1], [*groups[-1], index]]
-        fresh = phase.arrive != "moving"
+        fresh = phase.arrive is not Arrival.MOVING
     return groups
 
 

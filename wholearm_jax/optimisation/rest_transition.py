@@ -33,7 +33,7 @@ from wholearm_jax.margin import (
     affine_coefficients,
     cone_facets,
 )
-from wholearm_jax.model import Phase, Scene, TorqueSchedule, uniform_schedule
+from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, uniform_schedule
 from wholearm_jax.phases import TracedPhase, statics_at_start
 
 MIN_ACCELERATION = (
@@ -103,7 +103,7 @@ def rest_transitions(
 
     def lasts(k):
         length = float(scene.phases[k].duration)
-        moves = scene.phases[k].arrive != "hold"
+        moves = scene.phases[k].arrive is not Arrival.HOLD
         return float(np.clip(length, *durations)) if durations is not None and moves else length
 
     def moving(k):
@@ -122,8 +122,8 @@ def rest_transitions(
         k, onward = group[-1], following[0]
         if any(int(traced[n].dynamics.status) != Status.OK or not float(tops[n].value) > 0 for n in (k, onward)):
             return None
-        before = resting(k) if scene.phases[k].arrive == "hold" else moving(k)
-        after = None if scene.phases[onward].arrive == "hold" else moving(onward)
+        before = resting(k) if scene.phases[k].arrive is Arrival.HOLD else moving(k)
+        after = None if scene.phases[onward].arrive is Arrival.HOLD else moving(onward)
         return rest_transition(before, resting(onward), after, rate_limit, lead, near(group, begin))
 
     found: list[RestTransition | None] = []

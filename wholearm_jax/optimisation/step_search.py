@@ -19,7 +19,7 @@ import numpy as np
 
 from wholearm_jax.core import BackgroundTask, Status, compile_in_background, require_x64, wait_for
 from wholearm_jax.margin import affine_coefficients, best_quasistatic_torque
-from wholearm_jax.model import Phase, Scene, TorqueSchedule, pad_schedule, replace_duration, round_up
+from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, pad_schedule, replace_duration, round_up
 from wholearm_jax.phases import (
     Result,
     TracedPhase,
@@ -86,7 +86,7 @@ def precompile_search() -> BackgroundTask:
 
 
 def _arriving(phase: Phase) -> Phase:
-    return Phase(phase.name, phase.formation, phase.target, phase.duration, arrive="caught")
+    return Phase(phase.name, phase.formation, phase.target, phase.duration, arrive=Arrival.ANY_SPEED)
 
 
 def _search_phase(at: TracedPhase, longest: float) -> tuple[np.ndarray, float, int]:
@@ -133,6 +133,8 @@ _hold, _coefficients = eqx.filter_jit(best_quasistatic_torque), eqx.filter_jit(a
 def _attempt(dynamics, torque, longest) -> tuple[Status, float, float]:
     """One simulation under constant torques: status, margin and the time at which it ended."""
     schedule = pad_schedule(TorqueSchedule(jnp.asarray([0.0, longest]), jnp.asarray(np.stack([torque, torque]))))
-    outcome = simulate_phase(dynamics, schedule, jnp.zeros(()), jnp.asarray(longest), IntegratorOptions(), "caught")
+    outcome = simulate_phase(
+        dynamics, schedule, jnp.zeros(()), jnp.asarray(longest), IntegratorOptions(), Arrival.ANY_SPEED
+    )
     end = float(outcome.motion.phase_time[int(outcome.motion.count)]) * longest
     return Status(int(outcome.assessment.status)), float(outcome.margin_result.margin), max(end, 1e-6)

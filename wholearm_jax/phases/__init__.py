@@ -1,6 +1,6 @@
 """Phases one after the other: trace, simulate, assess, describe, sample, differentiate."""
 
-from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, GOALS, IMPULSE_ROUNDING, assess_phase
+from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, IMPULSE_ROUNDING, assess_phase
 from wholearm_jax.phases.compressive_margin import margin
 from wholearm_jax.phases.gradients import check_gradient
 from wholearm_jax.phases.phase_ends import describe_end, final_configuration, statics_at_start, target_configuration

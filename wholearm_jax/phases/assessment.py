@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int
 from wholearm_jax.core import Status
 from wholearm_jax.dynamics import Impact, PathDynamics
 from wholearm_jax.margin import MarginResult, force_slack
+from wholearm_jax.model import Arrival
 from wholearm_jax.simulation import Motion
 
 DEFAULT_ARRIVAL = 1e-6  # distance from its path's end, in path lengths, within which a phase must end
@@ -15,9 +16,6 @@ ARRIVAL_SPEED_FACTOR = 12.0
 """Speed allowed at arrival: within a distance `a` of the end, in path lengths, it is at most `sqrt(12 a)` path lengths
 per duration, from which braking at 6 lengths per duration squared (the uniform rest-to-rest motion) stops within `a`.
 Nearer to the end, time and position do not fix the speed better than this square root."""
-
-GOALS = {"moving": 0, "caught": 0, "rest": 1, "hold": 2}
-"""How a phase must end, as a number that compiled programs take: at any speed, at rest, where it began."""
 
 IMPULSE_ROUNDING = 1e-9  # fraction of `Impact.size` by which rounding may make an impulse negative
 
@@ -34,7 +32,7 @@ def assess_phase(
     dynamics: PathDynamics,
     motion: Motion,
     margin_result: MarginResult,
-    goal: Int[Array, ""],
+    goal: Arrival | Int[Array, ""],
     impact: Impact,
     arrival: float | Float[Array, ""] = DEFAULT_ARRIVAL,
 ) -> Assessment:
@@ -48,17 +46,17 @@ def assess_phase(
         dynamics: Tabulated path dynamics.
         motion: Simulated motion.
         margin_result: Margin of the motion, with the first loss of contact.
-        goal: How the phase must end, one of `GOALS`.
+        goal: How the phase must end, an `Arrival`.
         impact: Impact at which the phase is entered.
         arrival: Distance from the path's end within which the phase must end, in path lengths.
     """
-    holds = goal == GOALS["hold"]
+    holds = goal == Arrival.HOLD
     slack = force_slack(dynamics, impact.impulse)  # impulses have the cones of forces
     pulls = slack.min() < -IMPULSE_ROUNDING * impact.size
     contact_lost, end_time = int(Status.CONTACT_LOST), motion.phase_time[motion.count]
     is_lost = jnp.isfinite(margin_result.loss_time) & ~holds
     hold_status, departure_time = _assess_hold(motion)
-    arrival_status = _assess_arrival(dynamics, motion, goal == GOALS["rest"], arrival)
+    arrival_status = _assess_arrival(dynamics, motion, goal == Arrival.AT_REST, arrival)
     rows = (  # condition, status, phase time, contact
         (dynamics.status != int(Status.OK), dynamics.status, 0.0, -1),
         (pulls, contact_lost, 0.0, jnp.argmin(slack)),

@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from wholearm_jax.model import Scene, TorqueSchedule
+from wholearm_jax.model import Arrival, Scene, TorqueSchedule
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.plan_schedule import has_torque_jumps, with_plan_step_capacity
 from wholearm_jax.phases.plan_simulation import simulate_phases
@@ -54,7 +54,7 @@ def plan_margin(scene: Scene, simulated: tuple[SimulatedPhase, ...]) -> Float[Ar
     Raises ValueError for a plan that only holds its object.
     """
     pairs = zip(simulated, scene.phases, strict=True)
-    margins = [s.margin_result.margin for s, phase in pairs if phase.arrive != "hold"]
+    margins = [s.margin_result.margin for s, phase in pairs if phase.arrive is not Arrival.HOLD]
     if not margins:
         raise ValueError("a plan that only holds its object has no margin of a motion, see Result.hold_margin")
     return jnp.stack([jnp.where(jnp.isfinite(m), m, -jnp.inf) for m in margins]).min()

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, Int
 
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.margin import RestAccelerations, Statics, contact_statics
-from wholearm_jax.model import FEATURE_GROUPS, FINGER_ROOT, PALM_END, Phase, Scene, contact_name
+from wholearm_jax.model import FEATURE_GROUPS, FINGER_ROOT, PALM_END, Arrival, Phase, Scene, contact_name
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.simulation import Motion
 from wholearm_jax.tracing import PathEnd
@@ -32,7 +32,7 @@ def final_configuration(dynamics: PathDynamics, motion: Motion) -> Float[Array, 
 
 def target_configuration(phase: Phase, traced: TracedPhase) -> Float[Array, "5"]:
     """Return `z` (SI) where a phase should end: at its path's end, or where it began if it holds the object."""
-    return traced.begin if phase.arrive == "hold" else traced.end
+    return traced.begin if phase.arrive is Arrival.HOLD else traced.end
 
 
 def statics_at_start(scene: Scene, phase: Phase, traced: TracedPhase) -> tuple[Statics, RestAccelerations]:
@@ -48,7 +48,7 @@ def statics_at_start(scene: Scene, phase: Phase, traced: TracedPhase) -> tuple[S
 
 def describe_end(traced: TracedPhase, phase: Phase, capacity: int) -> str:
     """Say why a phase ends; `capacity` is the number of rows of the object's vertices."""
-    if phase.arrive == "hold":
+    if phase.arrive is Arrival.HOLD:
         return "the object is held"
     reason, index = int(traced.path.end_reason), int(traced.path.end_contact)
     if reason == PathEnd.CONTACT_MADE:

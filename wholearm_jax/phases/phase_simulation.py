@@ -8,13 +8,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from wholearm_jax.core import CachedJit, Status, as_device_array, as_strong_array
 from wholearm_jax.dynamics import Impact, PathDynamics, evaluate, locate_panel, placeholder_dynamics, resolve_impact
 from wholearm_jax.margin import MarginResult, minimum_margin
-from wholearm_jax.model import TorqueSchedule, restrict_to_phase, uniform_schedule
-from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL, GOALS, Assessment, assess_phase
+from wholearm_jax.model import Arrival, TorqueSchedule, restrict_to_phase, uniform_schedule
+from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL, Assessment, assess_phase
 from wholearm_jax.phases.phase_tracing import MIN_LENGTH
 from wholearm_jax.simulation import IntegratorOptions, Motion, simulate_motion, tolerance_as_data
 from wholearm_jax.tracing import Resolution
@@ -38,7 +38,7 @@ def simulate_phase(
     start,
     duration,
     options: IntegratorOptions,
-    goal,
+    goal: Arrival | Int[Array, ""],
     incoming_velocity=None,
     arrival=DEFAULT_ARRIVAL,
 ) -> SimulatedPhase:
@@ -50,7 +50,7 @@ def simulate_phase(
         start: Time at which the phase begins [s].
         duration: Time that it has [s].
         options: Integrator options.
-        goal: How the phase must end: a word of `Phase.arrive`, or a number of `GOALS`.
+        goal: How the phase must end, an `Arrival`.
         incoming_velocity: `z_dot` (SI) at the end of the phase before, for a transition while moving (None: at rest).
         arrival: Distance from the path's end within which the phase must end, in path lengths.
     """
@@ -60,8 +60,8 @@ def simulate_phase(
         as_strong_array(a, dtype) for a in (start, duration, incoming_velocity, arrival)
     )
     options = tolerance_as_data(options, dtype)
-    goal = as_strong_array(GOALS[goal] if isinstance(goal, str) else goal, int)
-    return _simulate_phase(dynamics, schedule, start, duration, incoming_velocity, options, goal, arrival)
+    code = as_strong_array(goal, int)
+    return _simulate_phase(dynamics, schedule, start, duration, incoming_velocity, options, code, arrival)
 
 
 @CachedJit
@@ -104,5 +104,5 @@ def precompile_simulation(rows: int, options: IntegratorOptions) -> None:
         as_device_array(0.0),
         as_device_array(1.0),
         options,
-        "rest",
+        Arrival.AT_REST,
     )

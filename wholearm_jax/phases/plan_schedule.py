@@ -3,14 +3,14 @@
 import numpy as np
 
 from wholearm_jax.core import is_traced
-from wholearm_jax.model import Scene, TorqueSchedule, has_jumps
+from wholearm_jax.model import Arrival, Scene, TorqueSchedule, has_jumps
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
 
 def require_motion(scene: Scene) -> None:
     """Raise ValueError for a plan with a phase that holds the object, where only phases that move it make sense."""
     for phase in scene.phases:
-        if phase.arrive == "hold":
+        if phase.arrive is Arrival.HOLD:
             raise ValueError(f"phase '{phase.name}' holds the object; this is for phases that move it")
 
 
@@ -45,7 +45,7 @@ def has_torque_jumps(scenes: Scene, torque: TorqueSchedule) -> bool:
     first = 0.0
     for before, phase, end in zip([None, *scenes.phases], scenes.phases, ends, strict=False):
         # A phase that is left while moving may end early: then the next phase has its remaining torques.
-        if before is None or before.arrive != "moving":
+        if before is None or before.arrive is not Arrival.MOVING:
             first = float(np.min(end - np.asarray(phase.duration)))
         if has_jumps(torque, first, float(np.max(end))):
             return True

@@ -24,8 +24,8 @@ from wholearm_jax.core import (
     unstack_trees,
     wait_for,
 )
-from wholearm_jax.model import Phase, Scene, TorqueSchedule, pad_schedule, round_up
-from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL, GOALS
+from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, pad_schedule, round_up
+from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL
 from wholearm_jax.phases.phase_simulation import SimulatedPhase, precompile_simulation, simulate_phase
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.phases.plan_schedule import has_torque_jumps, require_covered, with_plan_step_capacity
@@ -140,7 +140,7 @@ def initial_carry(torque: TorqueSchedule):
 
 def phase_inputs(phase: Phase):
     """Return what `scan_step` needs of a phase: duration [s], goal, and whether it is left while moving."""
-    return phase.duration, as_device_array(GOALS[phase.arrive], int), as_device_array(phase.arrive == "moving")
+    return phase.duration, as_device_array(phase.arrive, int), as_device_array(phase.arrive is Arrival.MOVING)
 
 
 def scan_step(schedule: TorqueSchedule, options: IntegratorOptions, arrival, carry, phase):

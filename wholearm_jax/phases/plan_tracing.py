@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 
 from wholearm_jax.core import Status, as_device_array, is_traced, stack_trees, unstack_trees
-from wholearm_jax.model import Phase, Scene, rigid_body, scaled_mechanics
+from wholearm_jax.model import Arrival, Phase, Scene, rigid_body, scaled_mechanics
 from wholearm_jax.phases.phase_ends import target_configuration
 from wholearm_jax.phases.phase_tracing import TracedPhase, trace_phase, trace_phase_path
 from wholearm_jax.tracing import ContactPath, Resolution
@@ -41,7 +41,7 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     for phase in scene.phases:
         begin = initial_guess, as_device_array(not traced_phases)
         traced = _trace_refined(body, scene, phase, *begin, resolution, tolerance)
-        if phase.arrive == "hold" and int(traced.dynamics.status) != Status.OK:
+        if phase.arrive is Arrival.HOLD and int(traced.dynamics.status) != Status.OK:
             reversed_phase = eqx.tree_at(lambda p: p.target.sign, phase, -phase.target.sign)
             traced = _trace_refined(body, scene, reversed_phase, *begin, resolution, tolerance)
         traced_phases.append(traced)
@@ -83,7 +83,7 @@ def _scan_phases(trace_one, scene: Scene, resolution: Resolution):
         traced, begin, end = trace_one(formation, initial_guess, target, resolution, first, holds)
         return (jnp.where(holds, begin, end), jnp.asarray(False)), traced
 
-    phases = stack_trees([(p.formation, p.target, jnp.asarray(p.arrive == "hold")) for p in scene.phases])
+    phases = stack_trees([(p.formation, p.target, jnp.asarray(p.arrive is Arrival.HOLD)) for p in scene.phases])
     return jax.lax.scan(step, (scene.start, jnp.asarray(True)), phases)[1]
 
 
@@ -91,7 +91,7 @@ def _trace_refined(
     body, scene: Scene, phase: Phase, initial_guess, first, resolution: Resolution, tolerance: float
 ) -> TracedPhase:
     """Trace one phase, with more segments and panels until they suffice; at their limits it does not converge."""
-    inputs, holds = (phase.formation, initial_guess, phase.target), as_device_array(phase.arrive == "hold")
+    inputs, holds = (phase.formation, initial_guess, phase.target), as_device_array(phase.arrive is Arrival.HOLD)
     while True:
         traced = trace_phase(body, scene.hand, scene.gravity, *inputs, resolution, first, holds)
         dynamics = traced.dynamics

@@ -10,7 +10,7 @@ import numpy as np
 
 from wholearm_jax.core import Status
 from wholearm_jax.margin import RestInterval, contact_statics, rest_margin
-from wholearm_jax.model import Phase, Scene, TorqueSchedule
+from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule
 from wholearm_jax.phases.phase_ends import configuration
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.phase_tracing import TracedPhase
@@ -31,7 +31,7 @@ class PhaseResult:
     """
 
     name: str
-    arrive: str
+    arrive: Arrival
     contacts: tuple[str, ...]
     status: Status
     time: float
@@ -79,7 +79,7 @@ class Result:
     @property
     def critical_phase(self) -> PhaseResult:
         """The phase whose margin is the plan's."""
-        moving = [p for p in self.phases if p.arrive != "hold"]
+        moving = [p for p in self.phases if p.arrive is not Arrival.HOLD]
         return min(moving or self.phases, key=lambda p: p.margin)
 
     @property
@@ -148,7 +148,7 @@ def rest_intervals(
 
 def _with_holds(phase: PhaseResult) -> PhaseResult:
     """A phase is lost where the contacts cannot hold the object; one that only holds has its hold's margin."""
-    if phase.arrive == "hold" and phase.holds:
+    if phase.arrive is Arrival.HOLD and phase.holds:
         least = min(phase.holds, key=lambda held: held.margin)
         numbers = {"margin": least.margin, "margin_time": least.time, "margin_contact": least.contact}
         phase = replace(phase, **numbers, margin_s=float(phase.traced.dynamics.breakpoints[0]))

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from wholearm_jax.core import CachedJit, Status, require_positive
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.margin import contact_force, dense_output, evaluate_dense
-from wholearm_jax.model import TorqueSchedule, interval, pad_schedule, restrict_to_phase, round_up, torque_at
+from wholearm_jax.model import Arrival, TorqueSchedule, interval, pad_schedule, restrict_to_phase, round_up, torque_at
 from wholearm_jax.phases.result import Result
 from wholearm_jax.simulation import Motion
 
@@ -85,7 +85,7 @@ def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
     for phase in result.phases:
         if int(phase.traced.dynamics.status) != Status.OK:
             break
-        left = phase.arrive == "moving" or phase.status is not Status.OK
+        left = phase.arrive is Arrival.MOVING or phase.status is not Status.OK
         stop = (phase.time - phase.start) / phase.duration if left else 1.0
         phase_times = np.full(rows, stop)
         phase_times[:samples] = np.linspace(0.0, stop, samples)
