@@ -126,6 +126,19 @@ def test_new_names_of_the_changes_exist():
             assert hasattr(importlib.import_module(folder), attribute), name
 
 
+def test_old_names_of_the_root_lead_to_the_new_ones():
+    table = (ROOT / "CHANGELOG.md").read_text().split("### `import wholearm_jax as wa`")[1].split("###")[0]
+    rows = re.findall(r"^\| `wa\.(\w+)(?:\(\.\.\.\))?` \| `wa\.(\w+)", table, re.MULTILINE)
+    assert dict(rows) == wa._RENAMED
+    assert len(wa._RENAMED) == 4
+    for old, new in wa._RENAMED.items():
+        assert old not in wa.__all__
+        with pytest.warns(FutureWarning, match=rf"wholearm_jax\.{old} is now wholearm_jax\.{new} "):
+            assert getattr(wa, old) is getattr(wa, new)
+    with pytest.raises(AttributeError, match="no attribute 'wire'"):
+        _ = wa.wire
+
+
 def test_symbols_of_the_glossary_are_given_once():
     rows = re.findall(r"^\| ([^|]+) \|[^|]*\| `", (DOCS / "glossary.md").read_text(), re.MULTILINE)
     symbols = [row.strip() for row in rows if row.strip()]

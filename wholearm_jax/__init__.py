@@ -6,6 +6,9 @@ after the other), `optimisation`, `planning`, `ensembles` (many scenes), `execut
 `plotting`, `report` and `cli`. Each imports only from those above it.
 """
 
+import warnings
+from typing import TYPE_CHECKING
+
 from wholearm_jax.core import Status, configure
 from wholearm_jax.ensembles import check
 from wholearm_jax.files import load, parse, read_torque, save, write_torque
@@ -36,3 +39,21 @@ __all__ = [
     "trajectory",
     "write_torque",
 ]
+
+# Names of the root before the package was laid out in folders; CHANGELOG.md has the same table, and the others.
+_RENAMED = {
+    "Integration": "IntegratorOptions",
+    "Torque": "TorqueSchedule",
+    "search": "search_by_steps",
+    "torque": "torque_schedule",
+}
+
+if not TYPE_CHECKING:  # a type checker should refuse names that do not exist
+
+    def __getattr__(name: str):
+        """Return what an old name stands for, with a warning that gives the new one."""
+        if name not in _RENAMED:
+            raise AttributeError(f"module 'wholearm_jax' has no attribute {name!r}")
+        new = _RENAMED[name]
+        warnings.warn(f"wholearm_jax.{name} is now wholearm_jax.{new} (CHANGELOG.md)", FutureWarning, stacklevel=2)
+        return globals()[new]
