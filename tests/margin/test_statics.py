@@ -14,7 +14,8 @@ from wholearm_jax.margin.quasistatic import best_quasistatic_torque
 from wholearm_jax.margin.statics import contact_statics, rest_margin
 from wholearm_jax.model.scene import Arrival, replace_duration
 from wholearm_jax.model.schedule import pad_schedule
-from wholearm_jax.optimisation.rest_transition import RestTransition, holding_schedule
+from wholearm_jax.optimisation.plan_transitions import holding_schedule
+from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.phases.phase_ends import statics_at_start
 from wholearm_jax.phases.phase_simulation import simulate_phase
 from wholearm_jax.simulation.integrator import IntegratorOptions

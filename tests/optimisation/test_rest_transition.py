@@ -13,7 +13,7 @@ from wholearm_jax.optimisation.rest_transition import MIN_REST_MARGIN, Moving, R
 from wholearm_jax.phases.phase_ends import statics_at_start
 
 RATE = 2.0
-LEAD = 0.25
+MAX_DWELL = 0.25
 
 
 def at_rest(dynamics, segment, s, torque):
@@ -41,36 +41,36 @@ def share_of(change, torque, begin):
     dynamics, start = before.dynamics, onward.dynamics.breakpoints[0]
     braking, forces = at_rest(dynamics, dynamics.count - 1, dynamics.breakpoints[-1], torque)
     setting_out, next_forces = at_rest(onward.dynamics, 0, start, begin)
-    one, limit = np.append(1.0, torque), rest.balance.torque_limit
-    ahead, behind = ((row @ one) / np.linalg.norm(row[1:] * limit) for row in rest.departure)
+    one, limit = np.append(1.0, torque), rest.statics.torque_limit
+    ahead, behind = ((row @ one) / np.linalg.norm(row[1:] * limit) for row in rest.accelerations)
     stays = ahead <= 1e-9 - MIN_REST_MARGIN and behind >= MIN_REST_MARGIN - 1e-9
     if not (stays and braking < 0 and abs(setting_out) < 1e-6):
         return -np.inf
-    held = rest.balance.support(torque).margin / rest.bound
+    held = rest.statics.support(torque).margin / rest.bound
     return min(forces.min() / before.bound, next_forces.min() / onward.bound, held)
 
 
 def test_both_torques_serve_and_the_way_between_them_is_short_enough(change):
     before, rest, onward = change
-    found = rest_transition(before, rest, onward, RATE, LEAD)
+    found = rest_transition(before, rest, onward, RATE, MAX_DWELL)
     assert 0.5 < found.margin_fraction <= 1
-    assert share_of(change, found.torque, found.begin) == pytest.approx(found.margin_fraction, rel=1e-6)
-    assert 0 < found.lead <= LEAD
-    assert np.abs(found.begin - found.torque).max() == pytest.approx(RATE * found.lead, rel=1e-9)
-    acceleration, _ = at_rest(onward.dynamics, 0, onward.dynamics.breakpoints[0], found.begin)
+    assert share_of(change, found.torque, found.departure_torque) == pytest.approx(found.margin_fraction, rel=1e-6)
+    assert 0 < found.dwell_time <= MAX_DWELL
+    assert np.abs(found.departure_torque - found.torque).max() == pytest.approx(RATE * found.dwell_time, rel=1e-9)
+    acceleration, _ = at_rest(onward.dynamics, 0, onward.dynamics.breakpoints[0], found.departure_torque)
     assert acceleration == pytest.approx(0.0, abs=1e-9)
 
 
 def test_no_torques_nearby_or_far_serve_better(change):
     before, rest, onward = change
-    found = rest_transition(before, rest, onward, RATE, LEAD)
-    rng, limit, ahead = np.random.default_rng(1), rest.balance.torque_limit, rest.departure.ahead
+    found = rest_transition(before, rest, onward, RATE, MAX_DWELL)
+    rng, limit, ahead = np.random.default_rng(1), rest.statics.torque_limit, rest.accelerations.ahead
     best, tried = -np.inf, 0
     for size in np.repeat([1e-3, 1e-2, 0.1, 0.5], 100):
         torque = np.clip(found.torque + size * rng.normal(size=2), -limit, limit)
-        begin = found.begin + size * rng.normal(size=2)
+        begin = found.departure_torque + size * rng.normal(size=2)
         begin -= ahead[1:] * (ahead @ np.append(1.0, begin)) / (ahead[1:] @ ahead[1:])
-        if np.all(np.abs(begin) <= limit) and np.abs(begin - torque).max() <= RATE * LEAD:
+        if np.all(np.abs(begin) <= limit) and np.abs(begin - torque).max() <= RATE * MAX_DWELL:
             share = share_of(change, torque, begin)
             tried, best = tried + np.isfinite(share), max(best, share)
     assert tried > 10
@@ -79,10 +79,10 @@ def test_no_torques_nearby_or_far_serve_better(change):
 
 def test_a_torque_out_of_reach_is_none(change):
     before, rest, onward = change
-    from_far = ReachableTorque(-rest.balance.torque_limit, 0.01)
-    assert rest_transition(before, rest, onward, RATE, LEAD, from_far).margin_fraction == -np.inf
-    free = rest_transition(before, rest, onward, RATE, LEAD)
-    near = rest_transition(before, rest, onward, RATE, LEAD, ReachableTorque(free.torque, 0.01))
+    from_far = ReachableTorque(-rest.statics.torque_limit, 0.01)
+    assert rest_transition(before, rest, onward, RATE, MAX_DWELL, from_far).margin_fraction == -np.inf
+    free = rest_transition(before, rest, onward, RATE, MAX_DWELL)
+    near = rest_transition(before, rest, onward, RATE, MAX_DWELL, ReachableTorque(free.torque, 0.01))
     assert np.abs(near.torque - free.torque).max() <= 0.01 + 1e-9
 
 

@@ -25,7 +25,6 @@ from wholearm_jax.margin.quasistatic import (
 )
 from wholearm_jax.margin.statics import (
     MARGIN_TIE,
-    SOLVER_TOL,
     RestAccelerations,
     RestInterval,
     Statics,

@@ -20,6 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from wholearm_jax.core import LinearProgramme, LinearProgrammeSolution
 from wholearm_jax.model import (
     ContactFormation,
     Scene,
@@ -32,7 +33,6 @@ from wholearm_jax.model import (
 )
 
 FEASIBILITY_TOL = -1e-8  # least margin that counts as possible, over the unit of force: rounding
-SOLVER_TOL = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 MARGIN_CAP = 1e6  # the largest margin, over the unit of force: friction may let forces grow without end
 NO_ROWS = np.zeros((0, 3))
 MARGIN_TIE = (
@@ -79,6 +79,12 @@ class RestAccelerations(NamedTuple):
     ahead: Float[np.ndarray, "3"]
     behind: Float[np.ndarray, "3"]
 
+    def rest_rows(self, torque_unit: float | np.ndarray = 1.0) -> Float[np.ndarray, "2 3"]:
+        """Rows with `row @ (1, torque) <= 0` while the object stays, of unit size in the torque, in `torque_unit`."""
+        rows = np.stack([self.ahead, -self.behind])
+        rows[:, 1:] *= torque_unit
+        return rows / np.linalg.norm(rows[:, 1:], axis=1, keepdims=True)
+
 
 @dataclass(frozen=True)
 class Statics:
@@ -102,70 +108,89 @@ class Statics:
     def best(self, departure: RestAccelerations | None = None) -> StaticMargin:
         """The largest margin of all torques within limits; with a `departure`, of those that do not move the object."""
         limits = np.column_stack([-self.torque_limit, self.torque_limit])
-        return self._best(limits, _still(departure))
+        return self._best(limits, NO_ROWS if departure is None else departure.rest_rows())
 
     def steadiest(self, departure: RestAccelerations) -> StaticMargin:
         """A torque with `MARGIN_TIE` of the largest margin, as far as it can be from those that move the object."""
-        limits, still = np.column_stack([-self.torque_limit, self.torque_limit]), _still(departure)
+        limits, still = np.column_stack([-self.torque_limit, self.torque_limit]), departure.rest_rows()
         top = self._best(limits, still)
         if not top.margin > 0:
             return top
-        central = self._maximise(limits, (0.0, None), floor=MARGIN_TIE * top.margin / self.unit, still=still, apart=1.0)
-        return self.support(self._torque(central)) if central.status == 0 else top
+        floor = MARGIN_TIE * top.margin / self.unit
+        central = self._maximise(limits, (0.0, np.inf), floor=floor, still=still, apart=1.0)
+        return top if central is None else self.support(central.values["torque"])
 
     def loss_fraction(self, before, after) -> float:
         """The share of the way between two torques from which no forces hold the object: 1 if some always do."""
         ends = np.stack([before, after])
         limits = np.column_stack([ends.min(0), ends.max(0)])
-        found = self._maximise(limits, (0.0, 1.0), path=ends)
-        return float(found.x[-1]) if found.status == 0 else 0.0
-
-    @staticmethod
-    def _torque(found) -> Float[np.ndarray, "2"]:
-        return found.x[-3:-1]
+        last = self._maximise(limits, (0.0, 1.0), path=ends)
+        return 0.0 if last is None else float(last.values["m"][0])
 
     def _best(self, limits, still=NO_ROWS) -> StaticMargin:
         """Maximise the margin; where no forces are possible, minus the least adhesion."""
-        found = self._maximise(limits, (0.0, MARGIN_CAP), press=1.0, still=still)
-        if found.status != 0:
-            found = self._maximise(limits, (None, 0.0), press=1.0, adhesion=1.0, still=still)
-        if found.status != 0:
+        best = self._maximise(limits, (0.0, MARGIN_CAP), press=1.0, still=still)
+        if best is None:
+            best = self._maximise(limits, (-np.inf, 0.0), press=1.0, adhesion=1.0, still=still)
+        if best is None:
             return StaticMargin(-np.inf, self.names[0], limits.mean(1))
-        # Each contact's share of the price of the margin: its pressure's, and where it adheres that of its cone.
-        pressure, one, other = -found.ineqlin.marginals[: 3 * len(self.names)].reshape(3, -1)
-        price = pressure + self.friction * (one + other) * (found.x[-1] < 0)
-        return StaticMargin(float(found.x[-1]) * self.unit, self.names[int(np.argmax(price))], self._torque(found))
+        margin, multipliers = float(best.values["m"][0]), best.multipliers
+        # Each contact's part in what limits the margin: its pressure, and where it adheres its friction cone.
+        cone = self.friction * (multipliers["cone_above"] + multipliers["cone_below"])
+        weakest = int(np.argmax(multipliers["pressure"] + cone * (margin < 0)))
+        return StaticMargin(margin * self.unit, self.names[weakest], best.values["torque"])
 
-    def _maximise(self, limits, bounds, *, press=0.0, floor=0.0, adhesion=0.0, still=NO_ROWS, apart=0.0, path=None):
-        """The linear programme in `(c_n, c_t, d, tau1, tau2, m)` that maximises `m` within `bounds`, with
+    def _maximise(
+        self, limits, bounds, *, press=0.0, floor=0.0, adhesion=0.0, still=NO_ROWS, apart=0.0, path=None
+    ) -> LinearProgrammeSolution | None:
+        """Maximise `m` within `bounds` over forces as in `add_forces`, with `still @ (1, torque) <= -apart m`.
 
-            c_n >= press m + floor,     |c_t| <= mu (c_n - adhesion m),     still @ (1, tau) <= -apart m
+        Along a `path`, `torque = path[0] + m (path[1] - path[0])`.
+        """
+        programme = LinearProgramme()
+        self.add_forces(programme, level="m", press=press, floor=floor, adhesion=adhesion)
+        programme.add_variables("torque", *limits.T)
+        programme.add_variables("m", *bounds)
+        programme.at_most("rest", -still[:, 0], torque=still[:, 1:], m=apart)
+        if path is not None:
+            programme.equal("path", path[0], torque=np.eye(2), m=path[0] - path[1])
+        return programme.maximise("m")
 
-        and, along a `path`, `tau = path[0] + m (path[1] - path[0])`.
+    def add_forces(
+        self,
+        programme: LinearProgramme,
+        *,
+        level: str,
+        press: float = 0.0,
+        floor: float = 0.0,
+        adhesion: float = 0.0,
+        torque: str = "torque",
+        torque_unit: float | np.ndarray = 1.0,
+        prefix: str = "",
+    ) -> None:
+        """Add the forces of the object at rest to a linear programme:
+
+            c_n >= press m + floor,     |c_t| <= mu (c_n - adhesion m),     |d| <= D,     and their balance.
+
+        Args:
+            programme: gets the blocks `c_n`, `c_t` and `d`, in units of `unit`.
+            level: name of the block `m`.
+            press, floor, adhesion: as above.
+            torque: name of the block of torques.
+            torque_unit: unit of this block [N m].
+            prefix: of the names of all blocks and rows that are added.
         """
         count = len(self.names)
-        one, none, grip = np.eye(count), np.zeros((count, count)), np.diag(self.friction)
-        forces = np.block([[-one, none], [-grip, one], [-grip, -one]])
-        loosened = np.concatenate([np.full(count, press), *2 * [adhesion * self.friction]])
-        upper = np.column_stack([forces, np.zeros((3 * count, 4)), loosened])
-        moving = np.column_stack([np.zeros((len(still), 2 * count + 2)), still[:, 1:], np.full(len(still), apart)])
-        equal = np.column_stack([self.wrench, self.load[:, 1:], np.zeros(5)])
-        right = -self.load[:, 0]
-        if path is not None:
-            along = np.column_stack([np.zeros((2, 2 * count + 2)), np.eye(2), path[0] - path[1]])
-            equal, right = np.vstack([equal, along]), np.append(right, path[0])
-        free = [(None, None)] * (2 * count)
-        from scipy.optimize import linprog  # takes half a second to import, and most plans have no holds
-
-        return linprog(
-            np.append(np.zeros(2 * count + 4), -1.0),
-            A_ub=np.vstack([upper, moving]),
-            b_ub=np.concatenate([np.full(count, -floor), np.zeros(2 * count), -still[:, 0]]),
-            A_eq=equal,
-            b_eq=right,
-            bounds=[*free, *zip(-self.dry, self.dry, strict=True), *limits.tolist(), bounds],
-            options=SOLVER_TOL,
-        )
+        one, cone, zero, unbounded = np.eye(count), np.diag(self.friction), np.zeros(count), np.full(count, np.inf)
+        c_n, c_t, d = (prefix + name for name in ("c_n", "c_t", "d"))
+        programme.add_variables(c_n, -unbounded, unbounded)
+        programme.add_variables(c_t, -unbounded, unbounded)
+        programme.add_variables(d, -self.dry, self.dry)
+        programme.at_most(prefix + "pressure", zero - floor, **{c_n: -one, level: press})
+        for name, side in (("cone_above", one), ("cone_below", -one)):
+            programme.at_most(prefix + name, zero, **{c_n: -cone, c_t: side, level: adhesion * self.friction})
+        forces = dict(zip((c_n, c_t, d), np.split(self.wrench, [count, 2 * count], axis=1), strict=True))
+        programme.equal(prefix + "balance", -self.load[:, 0], **forces, **{torque: self.load[:, 1:] * torque_unit})
 
 
 def contact_statics(scene: Scene, formation: ContactFormation, z: Float[Array, "5"]) -> Statics:
@@ -223,11 +248,3 @@ def _corners(schedule: TorqueSchedule, start: float, end: float):
     first = np.searchsorted(times, start + near, side="right") - 1
     last = np.searchsorted(times, end - near, side="left") - 1
     return [start, *times[inside].tolist(), end], [at(start, first), *values[inside], at(end, last)]
-
-
-def _still(departure: RestAccelerations | None) -> Float[np.ndarray, "rows 3"]:
-    """Rows with `row @ (1, tau) <= 0` while the object stays, of unit size in the torque."""
-    if departure is None:
-        return NO_ROWS
-    rows = np.stack([departure.ahead, -departure.behind])
-    return rows / np.linalg.norm(rows[:, 1:], axis=1, keepdims=True)

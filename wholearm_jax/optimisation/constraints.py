@@ -7,7 +7,7 @@ Derivation: section 9 of `docs/derivation.md`.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -43,9 +43,15 @@ class Limits(eqx.Module):
     force_scale: Float[Array, "phases"]  # unit of forces [N]
 
 
-HAS_PHASE_AXIS = Limits(  # which limits have an entry for each phase
-    rate=False, shortest=True, longest=True, min_transition_speed=False, fixed_torques=True, force_scale=True
-)  # pyright: ignore
+_PHASE_AXES: Any = {
+    "rate": False,
+    "shortest": True,
+    "longest": True,
+    "min_transition_speed": False,
+    "fixed_torques": True,
+    "force_scale": True,
+}
+HAS_PHASE_AXIS = Limits(**_PHASE_AXES)  # which limits have an entry a phase
 
 
 class ConstraintValues(NamedTuple):

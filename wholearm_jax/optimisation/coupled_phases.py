@@ -73,20 +73,22 @@ class CoupledPhases:
     @property
     def pins(self) -> dict[tuple[int, int], np.ndarray]:
         """Torques that stay as they are, in units of their limits, by phase and knot."""
-        begin = [] if self.begin is None else [((0, 0), self.begin, self.begin.begin / self.limits[0])]
+        begin = [] if self.begin is None else [((0, 0), self.begin, self.begin.departure_torque / self.limits[0])]
         end = [] if self.end is None else [((-1, -1), self.end, self.end.torque / self.limits[-1])]
-        return {at: torque for at, change, torque in [*begin, *end] if change.serves}
+        return {at: torque for at, change, torque in [*begin, *end] if change.is_feasible}
 
     @property
     def most(self) -> float:
         """The share of the bounds that the torques at both ends allow."""
-        changes = [change.margin_fraction for change in (self.begin, self.end) if change is not None and change.serves]
+        changes = [
+            change.margin_fraction for change in (self.begin, self.end) if change is not None and change.is_feasible
+        ]
         return min([1.0, *changes])
 
     @property
     def lead(self) -> np.ndarray:
         """How long the object waits in each phase before it sets out."""
-        first = self.begin.lead if self.begin is not None else 0.0
+        first = self.begin.dwell_time if self.begin is not None else 0.0
         return np.append(first, np.zeros(len(self.phases) - 1))
 
     @property
@@ -125,7 +127,7 @@ def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> tuple[list[Torqu
         where = 100 * float(group.certificates[weakest].path_fraction)
         why = f"no torque within limits holds this formation at {where:.0f} % of its wire"
         return _schedules(group, begins[0]), why, []
-    if group.begin is not None and not group.begin.serves:
+    if group.begin is not None and not group.begin.is_feasible:
         return _schedules(group, begins[0]), "no torque lets this formation take over at the limited rate", []
     problem = group.problem(_limits(group))
     method = descent_method(wanted.optimiser, len(group.phases), extra_parts(problem.phase_dynamics))
@@ -154,8 +156,8 @@ def _schedules(group: CoupledPhases, p: Variables) -> list[TorqueSchedule]:
     """Each phase's schedule, from time 0."""
     values, lengths = np.asarray(p.torque) * group.limits[:, None], np.exp(np.asarray(p.log_duration))
     first, *others = [uniform_schedule(length, rows) for length, rows in zip(lengths, values, strict=True)]
-    if group.begin is not None and group.begin.lead > 0:
-        times = np.append(0.0, group.begin.lead + np.asarray(first.times))
+    if group.begin is not None and group.begin.dwell_time > 0:
+        times = np.append(0.0, group.begin.dwell_time + np.asarray(first.times))
         first = TorqueSchedule(as_device_array(times), as_device_array(np.vstack([group.begin.torque, first.values])))
     return [first, *others]
 

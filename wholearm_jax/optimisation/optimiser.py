@@ -54,7 +54,8 @@ from wholearm_jax.optimisation.coupled_phases import (
 from wholearm_jax.optimisation.initial_guess import initial_guesses
 from wholearm_jax.optimisation.iteration import init_solver, take_step
 from wholearm_jax.optimisation.multiple_shooting import extra_parts
-from wholearm_jax.optimisation.rest_transition import RestTransition, holding_schedule, rest_transitions
+from wholearm_jax.optimisation.plan_transitions import holding_schedule, rest_transitions
+from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.optimisation.solver import INTERVAL_OPTIONS, IterationRecord
 from wholearm_jax.optimisation.variables import Variables
 from wholearm_jax.phases import (
