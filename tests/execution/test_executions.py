@@ -32,7 +32,7 @@ from wholearm_jax.execution.executions import (
 )
 from wholearm_jax.execution.mujoco_model import CONVEX, ContactCompliance, _wedges, build_mujoco_model
 from wholearm_jax.execution.trials import Amounts, _draw_scenes, _summary, run_trials, start_near
-from wholearm_jax.files.results import _perturbed_row, write_execution
+from wholearm_jax.files.execution_results import _perturbed_row, write_execution
 from wholearm_jax.model.kinematics import contact_kinematics, contact_set, normal_jacobian
 from wholearm_jax.model.mechanics import scaled_mechanics
 from wholearm_jax.model.scene import contact_formation, parse_contact, rigid_body

@@ -12,7 +12,8 @@ from wholearm_jax.files.results import summary, write_summary, write_torque, wri
 from wholearm_jax.files.scene_toml import load, parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan_simulation import simulate
-from wholearm_jax.report.page import _worst, load_result_folder, render, report
+from wholearm_jax.report.page import render, report
+from wholearm_jax.report.result_folder import critical_phase, load_result_folder
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 CHROMIUM = next((path for path in map(shutil.which, NAMES) if path), None)
@@ -82,7 +83,7 @@ def test_a_plan_without_motion(folder):
     failed = written.summary | {"status": "singular", "margin": None, "message": "near: singular"}
     blank = {"status": "singular", "margin": None, "margin_time": None, "bound": None}
     failed["phases"] = [row | blank for row in failed["phases"]]
-    page = render(written._replace(summary=failed, courses={}))
+    page = render(written._replace(summary=failed, trajectories={}))
     assert "There is no motion to show" in page
     assert drawn(page)["phases"] == []
 
@@ -301,6 +302,6 @@ def test_the_margin_is_that_of_a_phase_that_moves():
     """As a plan's is: not that of a hold, and none where a phase has none."""
     moves, holds = {"name": "slide", "margin": 0.8}, {"name": "hold", "margin": 0.1}
     plan = {"phase": [{"name": "slide"}, {"name": "hold", "hold": True}]}
-    assert _worst({"phases": [moves, holds], "scene": plan}) is moves
-    assert _worst({"phases": [moves | {"margin": None}, holds], "scene": plan}) is None
-    assert _worst({"phases": [holds], "scene": {"phase": plan["phase"][1:]}}) is holds
+    assert critical_phase({"phases": [moves, holds], "scene": plan}) is moves
+    assert critical_phase({"phases": [moves | {"margin": None}, holds], "scene": plan}) is None
+    assert critical_phase({"phases": [holds], "scene": {"phase": plan["phase"][1:]}}) is holds

@@ -3,6 +3,7 @@
 Slow imports stay inside functions: a command that does not need them starts at once.
 """
 
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -95,3 +96,8 @@ def make_output_folder(out: Path | None) -> Path | None:
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()
     return out
+
+
+def note(text: str) -> None:
+    """Print a note on standard error."""
+    print(f"wholearm: note: {text}", file=sys.stderr)

@@ -18,10 +18,11 @@ from wholearm_jax.cli.arguments import (
     TORQUE_HELP,
     BadInput,
     SceneName,
+    note,
     parse_ensemble,
     refuse_unwritable,
 )
-from wholearm_jax.cli.prediction import note, note_limit_violations
+from wholearm_jax.cli.prediction import note_limit_violations
 from wholearm_jax.cli.processes import ProcessRank, join_processes, use_all_processors
 from wholearm_jax.cli.progress import count_progress
 from wholearm_jax.core import configure
@@ -212,6 +213,7 @@ def _summarise(store, scene, source, out: Path):
 
     from wholearm_jax.core import write_atomically
     from wholearm_jax.ensembles import Ensemble, most_influential, rank_correlations, summarise
+    from wholearm_jax.files import FileSet, null_for_undefined, replace_files
     from wholearm_jax.plotting import plot_ensemble, save_figure
 
     summary = summarise(scene, (store.read(k) for k in range(store.chunks)), store.count)
@@ -222,7 +224,9 @@ def _summarise(store, scene, source, out: Path):
         mapped = tuple((source.parameters[k], offsets[:, k]) for k in most_influential(source.parameters, influence))
         pairs = zip(source.parameters, influence.tolist(), strict=True)
         more = {"influence": {name: rank for name, rank in pairs if rank}}
-    with refuse_unwritable(str(out)):
-        write_atomically(out.with_suffix(".json"), json.dumps(summary.as_dict() | more, indent=1) + "\n")
-        save_figure(lambda: plot_ensemble(summary, more.get("influence"), mapped), out.parent, out.stem)
+    files = FileSet(f"{out.stem}.json", (), (out.stem,))
+    with refuse_unwritable(str(out)), replace_files(out.parent, files) as scratch:
+        content = null_for_undefined(summary.as_dict() | more)
+        write_atomically(scratch / files.record, json.dumps(content, indent=1, allow_nan=False) + "\n")
+        save_figure(lambda: plot_ensemble(summary, more.get("influence"), mapped), scratch, out.stem)
     return summary

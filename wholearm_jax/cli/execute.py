@@ -1,7 +1,6 @@
 """`wholearm execute`: a torque schedule on free bodies with soft contacts."""
 
 import sys
-import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +14,7 @@ from wholearm_jax.cli.arguments import (
     make_output_folder,
     refuse_unwritable,
 )
+from wholearm_jax.cli.output import may_replace
 from wholearm_jax.cli.prediction import simulate_or_exit, trace_or_exit
 from wholearm_jax.cli.progress import count_progress
 
@@ -46,7 +46,7 @@ def execute(
         if error.name not in ("mujoco", "joblib"):
             raise
         raise BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
-    from wholearm_jax.files import read_torque
+    from wholearm_jax.files import EXECUTION_FILES, read_torque
 
     schedule, amounts = read_torque(torque), Amounts(*fractions, geometry, start)
     if perturb:
@@ -65,10 +65,12 @@ def execute(
     execution = rollout(prediction, **settings)
     _print_events(execution)
     trials = _run_trials(prediction, perturb, amounts, seed=seed, **settings) if perturb else None
+    ok = execution.ending is ExecutionOutcome.OK
+    folder = folder if folder and may_replace(folder, EXECUTION_FILES, ok) else None
     if folder is not None:
         _write_execution(execution, trials, torque, folder, video)
     print(f"executed: {execution.message}" + (f" -> {folder}" if folder else ""))
-    sys.exit(0 if execution.ending is ExecutionOutcome.OK else 1)
+    sys.exit(0 if ok else 1)
 
 
 def _fraction(option: str, text: str) -> float:
@@ -109,28 +111,23 @@ def _run_trials(prediction, count: int, amounts, **settings):
 def _write_execution(execution, trials, torque: Path, folder: Path, video: bool) -> None:
     """Write an execution's files."""
     from wholearm_jax.core import write_atomically
-    from wholearm_jax.files import discard_execution, execution_summary, write_execution, write_summary
+    from wholearm_jax.files import EXECUTION_FILES, execution_summary, replace_files, write_execution, write_summary
 
-    with refuse_unwritable(f"--out {folder}"):
-        discard_execution(folder)
-        write_summary(execution_summary(execution, trials, torque=str(torque)), folder / "execution.json")
-        write_execution(execution, folder / "execution.csv")
-        write_atomically(folder / "model.xml", execution.model_xml)
-        _write_figures(execution, folder, video)
+    with refuse_unwritable(f"--out {folder}"), replace_files(folder, EXECUTION_FILES) as scratch:
+        write_summary(execution_summary(execution, trials, torque=str(torque)), scratch / "execution.json")
+        write_execution(execution, scratch / "execution.csv")
+        write_atomically(scratch / "model.xml", execution.model_xml)
+        _write_figures(execution, scratch, video)
 
 
 def _write_figures(execution, folder: Path, video: bool) -> None:
     """Write the figure of an execution and, with `video`, its strip of poses and animation."""
     import matplotlib.pyplot as plt
 
-    from wholearm_jax.core import write_atomically
     from wholearm_jax.plotting import animate, plot_execution, plot_execution_strip, save_figure
 
     save_figure(lambda: plot_execution(execution), folder, "execution")
     if video:
         save_figure(lambda: plot_execution_strip(execution), folder, "frames")
-        with tempfile.TemporaryDirectory() as scratch:
-            path = Path(scratch, "execution.gif")
-            animate(execution).save(path, writer="pillow")  # pillow needs no further program
-            write_atomically(folder / "execution.gif", path.read_bytes())
+        animate(execution).save(folder / "execution.gif", writer="pillow")  # pillow needs no further program
         plt.close("all")

@@ -3,8 +3,9 @@
 import sys
 from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
-from wholearm_jax.cli.arguments import refuse_unwritable
+from wholearm_jax.cli.arguments import note, refuse_unwritable
 
 
 def print_phases(result) -> None:
@@ -15,26 +16,58 @@ def print_phases(result) -> None:
             print(f"    {rest.message}")
 
 
-def write_and_exit(result, folder: Path | None, samples: int, report: bool = False, **more) -> None:
+def write_and_exit(result, folder: Path | None, samples: int, report: bool = False, **more) -> NoReturn:
     """Write the files, print the result's message, and exit with its status."""
     write_result(result, folder, samples, report, **more)
     sys.exit(0 if result.status.value == 0 else 1)
 
 
 def write_result(result, folder: Path | None, samples: int, report: bool = False, **more) -> None:
-    """Write the files in place of those of an earlier result, and print the result's message."""
-    if folder is not None:
-        from wholearm_jax.files import discard, summary, write_summary, write_torque, write_trajectory
+    """Write the files in place of those of an earlier result, and print the result's message.
 
-        with refuse_unwritable(f"--out {folder}"):
-            discard(folder)
-            write_torque(result.torque, folder / "torque.csv")
-            write_trajectory(result, folder / "trajectory.csv", samples)
-            write_summary(summary(result, **more), folder / "summary.json")
-            _write_figures(result, folder)
-            if report:
-                write_report(folder, folder / "report.html")
+    A result without torques is not written, and one that is not `ok` not over one that is: notes say so.
+    """
+    import numpy as np
+
+    from wholearm_jax.files import RESULT_FILES
+
+    if folder is not None and not np.isfinite(result.torque.values).all():
+        note(f"--out {folder}: no torques were found; nothing is written")
+        folder = None
+    elif folder is not None and not may_replace(folder, RESULT_FILES, result.status.value == 0):
+        folder = None
+    if folder is not None:
+        _write_files(result, folder, samples, report, more)
     print(result.message if not folder else f"{result.message} -> {folder}")
+
+
+def may_replace(folder: Path, files, ok: bool) -> bool:
+    """Return whether a result may take the place of what a folder holds: one that is not ok not of one that is."""
+    from wholearm_jax.files import is_ok
+
+    if ok or not is_ok(folder, files):
+        return True
+    note(f"--out {folder}: the result there is ok and stays; this one is not, and is not written")
+    return False
+
+
+def _write_files(result, folder: Path, samples: int, report: bool, more: dict) -> None:
+    from wholearm_jax.files import (
+        RESULT_FILES,
+        replace_files,
+        summary,
+        write_summary,
+        write_torque,
+        write_trajectory,
+    )
+
+    with refuse_unwritable(f"--out {folder}"), replace_files(folder, RESULT_FILES) as scratch:
+        write_torque(result.torque, scratch / "torque.csv")
+        write_trajectory(result, scratch / "trajectory.csv", samples)
+        write_summary(summary(result, **more), scratch / "summary.json")
+        _write_figures(result, scratch)
+        if report:
+            write_report(scratch, scratch / "report.html")
 
 
 def write_report(folder: Path, path: Path) -> None:

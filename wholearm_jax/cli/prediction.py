@@ -1,11 +1,10 @@
 """Trace and simulate a plan for a command, refuse unusable input, and note doubtful input on standard error."""
 
-import sys
 from pathlib import Path
 
 import jax
 
-from wholearm_jax.cli.arguments import BadInput
+from wholearm_jax.cli.arguments import BadInput, note
 
 TOUCHING_TOL = 1e-6  # gap below which a contact touches, over the mechanics' unit of length
 
@@ -95,8 +94,3 @@ def note_limit_violations(scene, schedule, torque: Path) -> None:
 
     for joint, size, when, limit in limit_violations(schedule, scene.hand.torque_limit):
         note(f"{torque}: |tau{joint}| is {size:.4g} N m at t = {when:.4g} s, beyond the limit of {limit:.4g} N m")
-
-
-def note(text: str) -> None:
-    """Print a note on standard error."""
-    print(f"wholearm: note: {text}", file=sys.stderr)

@@ -10,7 +10,7 @@ from wholearm_jax.core.arrays import (
     take_row,
     unstack_trees,
 )
-from wholearm_jax.core.atomic_files import write_atomically
+from wholearm_jax.core.atomic_files import write_atomically, write_together
 from wholearm_jax.core.background_compile import BackgroundTask, compile_in_background, wait_for
 from wholearm_jax.core.config import configure
 from wholearm_jax.core.errors import BadInput, SceneError, StoreError

@@ -14,6 +14,7 @@ from wholearm_jax.execution.executions import (
 from wholearm_jax.execution.mujoco_model import CONVEX, ContactCompliance, build_mujoco_model
 from wholearm_jax.execution.trials import (
     Amounts,
+    PerturbedRun,
     TrialsResult,
     require_objects,
     rollout_in_parallel,
@@ -27,6 +28,7 @@ __all__ = [
     "ContactCompliance",
     "Execution",
     "ExecutionOutcome",
+    "PerturbedRun",
     "Tolerance",
     "TrialsResult",
     "build_mujoco_model",

@@ -1,14 +1,13 @@
 """TOML scenes, CSV and JSON results, NPZ polygons, and the Zarr store of checks."""
 
+from wholearm_jax.files.execution_results import execution_summary, write_execution
+from wholearm_jax.files.file_set import EXECUTION_FILES, RESULT_FILES, FileSet, is_ok, replace_files
 from wholearm_jax.files.polygons_npz import count_polygons, read_polygons
 from wholearm_jax.files.results import (
     TRAJECTORY_COLUMNS,
-    discard,
-    discard_execution,
-    execution_summary,
+    null_for_undefined,
     read_torque,
     summary,
-    write_execution,
     write_summary,
     write_torque,
     write_trajectory,
@@ -16,18 +15,22 @@ from wholearm_jax.files.results import (
 from wholearm_jax.files.scene_toml import Positive, bundled, explain_validation_error, load, parse, save, to_dict
 
 __all__ = [
+    "EXECUTION_FILES",
+    "RESULT_FILES",
     "TRAJECTORY_COLUMNS",
+    "FileSet",
     "Positive",
     "bundled",
     "count_polygons",
-    "discard",
-    "discard_execution",
     "execution_summary",
     "explain_validation_error",
+    "is_ok",
     "load",
+    "null_for_undefined",
     "parse",
     "read_polygons",
     "read_torque",
+    "replace_files",
     "save",
     "summary",
     "to_dict",

@@ -6,9 +6,10 @@ import csv
 import io
 import json
 import math
+from collections.abc import Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +17,6 @@ from wholearm_jax.core import SceneError, write_atomically
 from wholearm_jax.files.scene_toml import CONSTRAINTS, to_dict
 from wholearm_jax.model import COORDINATES, TorqueSchedule, torque_schedule
 from wholearm_jax.phases import Result, trajectory
-
-if TYPE_CHECKING:  # running them needs MuJoCo, writing does not
-    from wholearm_jax.execution import Execution, TrialsResult
 
 TORQUE_COLUMNS = ("t", "tau1", "tau2")
 _CONTACTS = range(1, CONSTRAINTS + 1)
@@ -76,7 +74,11 @@ def read_torque(path: str | Path) -> TorqueSchedule:
 
 
 def write_torque(schedule: TorqueSchedule, path: str | Path) -> None:
-    """Write a torque schedule (header `t,tau1,tau2`; s, N m) with every digit. Raises `OSError`.
+    """Write a torque schedule (header `t,tau1,tau2`; s, N m) with every digit.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: a number of the schedule is not finite.
 
     >>> wa.write_torque(wa.torque_schedule([0.0, 2.0], [[0.5, -0.2], [0.5, -0.4]]), folder / "torque.csv")
     >>> print((folder / "torque.csv").read_text(), end="")
@@ -85,25 +87,32 @@ def write_torque(schedule: TorqueSchedule, path: str | Path) -> None:
     2.0,0.5,-0.4
     """
     table = np.column_stack([np.asarray(schedule.times), np.asarray(schedule.values)])
-    write_atomically(path, _csv(TORQUE_COLUMNS, table.tolist()))
+    if not np.isfinite(table).all():
+        row = int(np.argmin(np.isfinite(table).all(axis=1)))
+        raise ValueError(f"a schedule with a number that is not finite, in row {row}, cannot be written")
+    write_atomically(path, csv_text(TORQUE_COLUMNS, table.tolist()))
 
 
 def write_trajectory(result: Result, path: str | Path, samples: int = 201) -> None:
     """Write every phase at `samples` times; forces are empty where friction holds the object at rest."""
     rows = []
-    for phase, course in zip(result.phases, trajectory(result, samples), strict=False):
-        blocks = (course.z, course.z_dot, course.torque, course.cn, course.ct)
-        for k, time in enumerate(np.asarray(course.time)):
-            numbers = [v for block in blocks for v in np.asarray(block)[k].tolist()]
-            rows.append([float(time), phase.name, *("" if math.isnan(v) else v for v in numbers)])
-    write_atomically(path, _csv(TRAJECTORY_COLUMNS, rows))
+    for phase, motion in zip(result.phases, trajectory(result, samples), strict=False):
+        blocks = (motion.z, motion.z_dot, motion.torque, motion.cn, motion.ct)
+        for k, time in enumerate(np.asarray(motion.time)):
+            rows.append([float(time), phase.name, *(v for block in blocks for v in np.asarray(block)[k].tolist())])
+    write_atomically(path, csv_text(TRAJECTORY_COLUMNS, rows))
 
 
 def summary(result: Result, *, bounds: tuple[float, ...] | None = None, **more: Any) -> dict[str, Any]:
-    """What became of a plan, as the summary file holds it, with the scene to run it again."""
-    phases = []
-    for k, phase in enumerate(result.phases):
-        row = {
+    """Return the content of `summary.json`: the result of each phase and of the plan, and the scene to run it again.
+
+    Args:
+        result: of the plan.
+        bounds: of each phase's margin [N].
+        more: further entries, such as the command and its settings.
+    """
+    phases = [
+        {
             "name": phase.name,
             "contacts": list(phase.contacts),
             "status": phase.status.label,
@@ -114,71 +123,14 @@ def summary(result: Result, *, bounds: tuple[float, ...] | None = None, **more: 
             "margin_time": phase.margin_time,
             "margin_contact": phase.margin_contact,
             "bound": None if bounds is None else bounds[k],
-            "holds": [_plain(held._asdict()) for held in phase.holds],
+            "holds": [rest._asdict() for rest in phase.holds],
             "message": phase.message,
         }
-        phases.append(_plain(row))
+        for k, phase in enumerate(result.phases)
+    ]
     head = {"status": result.status.label, "margin": result.margin, "hold_margin": result.hold_margin}
-    head["message"] = result.message
-    again = {"scene": to_dict(result.scene), "version": version("wholearm_jax")}
-    return _plain(head) | {"phases": phases} | _plain(more) | again
-
-
-def execution_summary(execution: Execution, robustness: TrialsResult | None = None, **more: Any) -> dict[str, Any]:
-    """What became of an execution, and of its perturbed copies, as the file `execution.json` holds it."""
-    head = {"status": execution.ending.value, "message": execution.message}
-    errors = {
-        "position_error": execution.position_error,
-        "angle_error": execution.angle_error,
-        "creep": execution.creep,
-    }
-    within = {"tolerance": _plain(execution.tolerance._asdict()), "open_at_end": list(execution.open_at_end)}
-    events = [event._asdict() for event in execution.events]
-    prediction = {"status": execution.prediction.status.label, "margin": execution.prediction.margin}
-    row = _plain(head | errors) | within | {"events": events, "prediction": _plain(prediction)}
-    if robustness is not None:
-        low, high = robustness.interval
-        row["perturbed"] = {
-            "amounts": _plain(robustness.amounts._asdict()),
-            "seed": robustness.seed,
-            "executions": len(robustness.runs),
-            "successes": robustness.successes,
-            "interval_95": [low, high],
-            "runs": [_perturbed_row(run) for run in robustness.runs],
-        }
-    return row | {"timestep": execution.timestep} | _plain(more) | {"scene": to_dict(execution.prediction.scene)}
-
-
-def _perturbed_row(run) -> dict[str, Any]:
-    drawn = {"friction": run.friction.tolist(), "mass": run.mass}
-    end = [value if math.isfinite(value) else None for value in run.end.tolist()]
-    errors = {"position_error": run.position_error, "angle_error": run.angle_error}
-    return drawn | {"status": run.ending.value} | _plain(errors) | {"end": end}
-
-
-def write_execution(execution: Execution, path: str | Path, samples: int = 201) -> None:
-    """Write an execution at about `samples` times a phase: `t`, `z`, its rates, and `c_n` of every planned contact."""
-    course, planned = execution.course, execution.planned
-    every = max(1, (len(course.time) - 1) // (samples * len(execution.prediction.phases)))
-    columns = [execution.names.index(name) for name in planned]
-    table = np.column_stack([course.time, course.z, course.z_dot, course.cn[:, columns]])[::every]
-    header = ("t", *COORDINATES, *(f"{c}_dot" for c in COORDINATES), *(f"cn {name}" for name in planned))
-    write_atomically(path, _csv(header, table.tolist()))
-
-
-def discard(folder: Path) -> None:
-    """Remove what an earlier result left in a folder: files of two results beside each other would mislead."""
-    _remove(folder, ("torque.csv", "trajectory.csv", "summary.json", "report.html"), ("plan", "result"))
-
-
-def discard_execution(folder: Path) -> None:
-    """The same for what an earlier execution left."""
-    _remove(folder, ("execution.json", "execution.csv", "execution.gif", "model.xml"), ("execution", "frames"))
-
-
-def _remove(folder: Path, files: tuple[str, ...], figures: tuple[str, ...]) -> None:
-    for name in (*files, *(f"{figure}.{kind}" for figure in figures for kind in ("png", "svg", "pdf"))):
-        (folder / name).unlink(missing_ok=True)
+    tail = {"scene": to_dict(result.scene), "version": version("wholearm_jax")}
+    return null_for_undefined(head | {"message": result.message, "phases": phases} | more | tail)
 
 
 def write_summary(content: dict[str, Any], path: str | Path) -> None:
@@ -186,14 +138,20 @@ def write_summary(content: dict[str, Any], path: str | Path) -> None:
     write_atomically(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
-def _plain(row: dict[str, Any]) -> dict[str, Any]:
-    """JSON has no infinity and no NaN: what is undefined is null."""
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+def null_for_undefined(content: Any) -> Any:
+    """Return lists and dictionaries with None for NaN and infinity, which JSON does not have."""
+    if isinstance(content, dict):
+        return {key: null_for_undefined(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [null_for_undefined(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
-def _csv(header, rows) -> str:
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return a table as CSV; cells of undefined numbers are empty."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(header)
-    writer.writerows(rows)
+    for row in rows:
+        writer.writerow(["" if isinstance(v, float) and not math.isfinite(v) else v for v in row])
     return buffer.getvalue()

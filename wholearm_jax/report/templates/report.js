@@ -12,8 +12,8 @@ function shape(name, attributes, parent) {
 
 const contactColour = (contact) => `var(--contact${contact.style[0]})`;
 const dashes = (contact, width) => data.dashes[contact.style[1]].map((d) => d * width).join(" ") || "none";
-const mixed = (a, b, share) => (a === null || b === null ? null : a + (b - a) * share);
-const mixedAll = (a, b, share) => a.map((v, k) => (Array.isArray(v) ? mixedAll(v, b[k], share) : mixed(v, b[k], share)));
+const interpolate = (a, b, fraction) => (a === null || b === null ? null : a + (b - a) * fraction);
+const interpolateAll = (a, b, fraction) => a.map((v, k) => (Array.isArray(v) ? interpolateAll(v, b[k], fraction) : interpolate(v, b[k], fraction)));
 
 // The plan at one time, linear between samples; at a change of formation the new one holds.
 function momentAt(time) {
@@ -26,8 +26,8 @@ function momentAt(time) {
     if (t[middle] <= time) low = middle; else high = middle;
   }
   const width = t[high] - t[low];
-  const share = width > 0 ? Math.min(1, Math.max(0, (time - t[low]) / width)) : 0;
-  const at = (name) => mixedAll(phase[name][low], phase[name][high], share);
+  const fraction = width > 0 ? Math.min(1, Math.max(0, (time - t[low]) / width)) : 0;
+  const at = (name) => interpolateAll(phase[name][low], phase[name][high], fraction);
   return { phase, z: at("z"), tau: at("tau"), cn: at("cn"), ct: at("ct"), places: at("places") };
 }
 
@@ -43,10 +43,10 @@ function outline(z) {
 }
 
 function finger(k, z) {
-  const [jx, jy] = data.hand.joint[k], way = [Math.cos(z[3 + k]), Math.sin(z[3 + k])];
+  const [jx, jy] = data.hand.joint[k], direction = [Math.cos(z[3 + k]), Math.sin(z[3 + k])];
   const side = (k === 0 ? 1 : -1) * data.hand.offset[k];
-  const base = [jx - side * way[1], jy + side * way[0]];
-  return [base, [base[0] + data.hand.length[k] * way[0], base[1] + data.hand.length[k] * way[1]]];
+  const base = [jx - side * direction[1], jy + side * direction[0]];
+  return [base, [base[0] + data.hand.length[k] * direction[0], base[1] + data.hand.length[k] * direction[1]]];
 }
 
 // The force on the object at contact k, as metres on the page.
@@ -97,7 +97,7 @@ function drawHand(svg, z, numbers) {
   });
 }
 
-// Arrows end where the link touches the object, so that they point the way it pushes.
+// Arrows end where the link touches the object, so that they point where it pushes.
 function drawForces(svg, moment) {
   moment.phase.contacts.forEach((contact, k) => {
     const [x, y] = moment.places[k];
@@ -106,9 +106,9 @@ function drawForces(svg, moment) {
     if (moment.cn[k] === null) return; // friction holds the object at rest: the forces are not determined
     const force = arrow(moment, k), length = Math.hypot(...force);
     if (length < 1e-4) return;
-    const way = force.map((v) => v / length), head = Math.min(5e-3, length);
-    const tail = [x - force[0], y - force[1]], neck = [x - head * way[0], y - head * way[1]];
-    const wing = (side) => [neck[0] - side * 0.4 * head * way[1], neck[1] + side * 0.4 * head * way[0]];
+    const direction = force.map((v) => v / length), head = Math.min(5e-3, length);
+    const tail = [x - force[0], y - force[1]], neck = [x - head * direction[0], y - head * direction[1]];
+    const wing = (side) => [neck[0] - side * 0.4 * head * direction[1], neck[1] + side * 0.4 * head * direction[0]];
     const group = shape("g", { class: "force" }, svg);
     shape("path", { d: `M ${path([tail, neck].map(to))}`, stroke: colour, "stroke-width": 1.5 }, group);
     shape("path", { d: `M ${path([[x, y], wing(1), wing(-1)].map(to))} Z`, fill: colour }, group);
@@ -121,9 +121,9 @@ function drawForces(svg, moment) {
 function ticks(low, high, count) {
   const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
   const step = power * [1, 2, 5, 10].find((m) => m * power >= rough);
-  const found = [];
-  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k += 1) found.push(k * step);
-  return { step, found, digits: Math.max(0, -Math.floor(Math.log10(step) + 1e-9)) };
+  const values = [];
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k += 1) values.push(k * step);
+  return { step, values, digits: Math.max(0, -Math.floor(Math.log10(step) + 1e-9)) };
 }
 
 // A plot: `curves` of {t, v, colour, dash, width}, `levels` of {v, colour, dash}; returns the line that shows the time.
@@ -138,13 +138,13 @@ function plot(svg, curves, levels, dot) {
   const x = (t) => edge.left + (width - edge.left - edge.right) * t / (data.end || 1);
   const y = (v) => height - edge.bottom - (height - edge.top - edge.bottom) * (v - low) / (high - low);
   const up = ticks(low, high, 5);
-  for (const v of up.found) {
+  for (const v of up.values) {
     shape("path", { d: `M ${edge.left} ${y(v)} H ${width - edge.right}`, stroke: "var(--line)", "stroke-width": v === 0 ? 1.5 : 0.75 }, svg);
     shape("text", { x: edge.left - 5, y: y(v) + 4, "text-anchor": "end" }, svg).textContent = v.toFixed(up.digits).replace("-", "\u2212");
   }
   const across = ticks(0, data.end || 1, width / 90);
-  for (const t of across.found) {
-    const last = t === across.found.at(-1), anchor = last && x(t) > width - 40 ? "end" : "middle";
+  for (const t of across.values) {
+    const last = t === across.values.at(-1), anchor = last && x(t) > width - 40 ? "end" : "middle";
     shape("text", { x: x(t), y: height - 7, "text-anchor": anchor }, svg).textContent = t.toFixed(across.digits) + (last ? " s" : "");
   }
   data.phases.forEach((phase, k) => {
@@ -204,7 +204,7 @@ function forcePlot() {
     const style = { t: phase.t, colour: contactColour(contact) };
     const pressed = { ...style, v: phase.cn.map((row) => row[k]), dash: dashes(contact, 1.75), width: 1.75 };
     if (!contact.rolls) return [pressed];
-    const inside = phase.cn.map((row, j) => (row[k] === null ? null : contact.grip * row[k] - Math.abs(phase.ct[j][k])));
+    const inside = phase.cn.map((row, j) => (row[k] === null ? null : contact.friction * row[k] - Math.abs(phase.ct[j][k])));
     return [pressed, { ...style, v: inside, dash: "2 2.5", width: 1.75 }];
   }));
   const dot = data.margin && { t: data.margin.margin_time, v: data.margin.margin };
