@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import evaluate, locate_panel
+from wholearm_jax.dynamics import evaluate, locate_panel
 from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.model.scene import replace_duration
 from wholearm_jax.optimisation.rest_transition import MIN_REST_MARGIN, Moving, ReachableTorque, Resting, rest_transition

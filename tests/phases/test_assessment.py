@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import Impact
+from wholearm_jax.dynamics import Impact
 from wholearm_jax.margin.contact_forces import MarginResult
 from wholearm_jax.model import Arrival
 from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, DEFAULT_ARRIVAL, IMPULSE_ROUNDING, assess_phase

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import evaluate, locate_panel, resolve_impact
+from wholearm_jax.dynamics import evaluate, locate_panel, resolve_impact
 from wholearm_jax.model.kinematics import normal_jacobian, tangential_jacobian
 from wholearm_jax.model.mechanics import scaled_mechanics
 from wholearm_jax.model.scene import Arrival, rigid_body

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import wholearm_jax
-from wholearm_jax.dynamics.path_dynamics import evaluate, locate_panel
+from wholearm_jax.dynamics import evaluate, locate_panel
 from wholearm_jax.margin import quasistatic as squeeze
 
 W, H, X, MASS, GRAVITY = 0.03, 0.06, 0.08, 0.2, 9.81

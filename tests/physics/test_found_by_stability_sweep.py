@@ -12,7 +12,7 @@ from matplotlib.path import Path
 from support import steadiest_difference
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import equations_of_motion, evaluate, locate_panel, placeholder_dynamics
+from wholearm_jax.dynamics import equations_of_motion, evaluate, locate_panel, placeholder_dynamics
 from wholearm_jax.margin.contact_forces import MAX_REFINED, SAMPLES_PER_STEP, minimum_margin, quintic_hermite
 from wholearm_jax.margin.quasistatic import best_quasistatic_torque, best_quasistatic_torque_batch
 from wholearm_jax.model.kinematics import contact_kinematics, gaps

@@ -10,7 +10,7 @@ from support import assert_modes_and_differences_agree, passing
 
 import wholearm_jax
 from tests.reference import unreduced
-from wholearm_jax.dynamics.path_dynamics import evaluate, locate_panel
+from wholearm_jax.dynamics import evaluate, locate_panel
 from wholearm_jax.files import scene_toml as scene_file
 from wholearm_jax.margin import quasistatic as squeeze
 from wholearm_jax.model.kinematics import (

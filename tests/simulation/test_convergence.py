@@ -12,7 +12,7 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.core.status import Status
-from wholearm_jax.dynamics.path_dynamics import placeholder_dynamics
+from wholearm_jax.dynamics import placeholder_dynamics
 from wholearm_jax.ensembles.ensemble import make_ensemble
 from wholearm_jax.model.schedule import pad_schedule, restrict_to_phase
 from wholearm_jax.simulation.integrator import IntegratorOptions

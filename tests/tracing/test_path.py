@@ -8,7 +8,7 @@ import pytest
 from support import ending_at_its_kink
 
 import wholearm_jax as wa
-from wholearm_jax.dynamics.path_dynamics import evaluate, evaluate_dot, locate_panel
+from wholearm_jax.dynamics import evaluate, evaluate_dot, locate_panel
 from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.model.kinematics import gaps, normal_jacobian, tangential_jacobian
 from wholearm_jax.model.mechanics import scaled_mechanics
