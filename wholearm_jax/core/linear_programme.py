@@ -89,11 +89,13 @@ class LinearProgramme:
         )
         if answer.status != 0:
             return None
-        starts = np.cumsum([len(rows.right) for rows in self._at_most])[:-1]
-        multipliers = np.split(-answer.ineqlin.marginals, starts)
+        ends = np.cumsum([len(rows.right) for rows in self._at_most])
         return LinearProgrammeSolution(
             {block: answer.x[at] for block, at in columns.items()},
-            {rows.name: part for rows, part in zip(self._at_most, multipliers, strict=True)},
+            {
+                rows.name: -answer.ineqlin.marginals[end - len(rows.right) : end]
+                for rows, end in zip(self._at_most, ends, strict=True)
+            },
         )
 
 
