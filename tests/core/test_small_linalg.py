@@ -23,7 +23,9 @@ def test_rows_of_very_different_sizes():
     rng = np.random.default_rng(1)
     matrix = rng.normal(size=(5, 5)) * 10.0 ** rng.integers(-6, 6, (5, 1))
     right = rng.normal(size=5)
-    np.testing.assert_allclose(solve(matrix, right), np.linalg.solve(matrix, right), rtol=1e-11)
+    np.testing.assert_allclose(
+        solve(jnp.asarray(matrix), jnp.asarray(right)), np.linalg.solve(matrix, right), rtol=1e-11
+    )
 
 
 def test_derivatives_in_both_modes():

@@ -48,9 +48,8 @@ def known(mechanics, guess, contact):
         rows = np.asarray(constraint_jacobian(mechanics.contacts, z))
         null = np.linalg.svd(rows)[2][-1]
         null = null / (null @ np.linalg.svd(rows0)[2][-1])
-        return np.append(
-            constraints(mechanics.contacts, z), np.asarray(tangential_jacobian(mechanics.contacts, z))[contact] @ null
-        )
+        slip = np.asarray(tangential_jacobian(mechanics.contacts, jnp.asarray(z)))[contact] @ null
+        return np.append(constraints(mechanics.contacts, z), slip)
 
     rows0 = np.asarray(constraint_jacobian(mechanics.contacts, guess))
     found = root(equations, guess, tol=1e-14)

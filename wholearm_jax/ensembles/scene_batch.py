@@ -1,7 +1,7 @@
 """Sources of scenes for a check: scenes stacked along a leading axis, and the interface shared with ensembles."""
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ from wholearm_jax.core import stack_trees
 from wholearm_jax.model import Scene
 
 
+@runtime_checkable
 class SceneSource(Protocol):
     """Numbered scenes to check: an `Ensemble`, or a `SceneBatch`."""
 

@@ -5,7 +5,7 @@ import re
 import tomllib
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tomli_w
@@ -72,7 +72,7 @@ class _Hand(_Strict):
     finger2: _Finger
 
     @model_validator(mode="after")
-    def _sides(self) -> Self:
+    def _sides(self) -> "_Hand":
         if self.finger1.joint[0] <= self.finger2.joint[0]:
             raise ValueError("finger 1 is the right one: its joint's x must exceed that of finger 2")
         return self
@@ -143,7 +143,7 @@ class _Phase(_Strict):
     arrive: Literal["rest", "moving", "caught"] | None = None
     hold: StrictBool = False
 
-    def complaint(self, before: Self | None) -> str | None:
+    def complaint(self, before: "_Phase | None") -> str | None:
         """The key that does not fit the others, and why; `before` is the phase before this one."""
         if not self.hold:
             return "toward: missing"
@@ -164,7 +164,7 @@ class _Scene(_Strict):
     phase: Annotated[list[_Phase], Field(min_length=1)]
 
     @model_validator(mode="after")
-    def _known_features(self) -> Self:
+    def _known_features(self) -> "_Scene":
         count = len(self.object.vertices)
         names = [phase.name for phase in self.phase]
         for k, phase in enumerate(self.phase):

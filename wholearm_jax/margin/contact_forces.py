@@ -134,7 +134,7 @@ def force_slack(dynamics: PathDynamics, forces: Float[Array, "rows"]) -> Float[A
 
 def cone_facets(
     dynamics: PathDynamics, forces: Float[Array, "rows *terms"], rolling: int = MAX_ROLLING
-) -> Float[Array, "rows *terms"]:
+) -> Float[Array, "facets *terms"]:
     """Linear functions of the forces whose least is the least `force_slack`: both sides of each friction cone.
 
     `forces` may be coefficients, by any linear terms. Four constraints have at most two tangential rows, and so there

@@ -193,7 +193,7 @@ class Statics:
         programme.equal(prefix + "balance", -self.load[:, 0], **forces, **{torque: self.load[:, 1:] * torque_unit})
 
 
-def contact_statics(scene: Scene, formation: ContactFormation, z: Float[Array, "5"]) -> Statics:
+def contact_statics(scene: Scene, formation: ContactFormation, z: Float[Array | np.ndarray, "5"]) -> Statics:
     """The balance of forces for an object at rest at `z` (SI) in a formation, of however many contacts."""
     mechanics, normal, slip = jax.device_get(_rows(scene, formation, z))
     slots, joints = list(formation.normal_rows), np.eye(5)[:, 3:]

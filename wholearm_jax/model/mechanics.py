@@ -9,6 +9,7 @@ Derivation: section 2 of `docs/derivation.md`.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from wholearm_jax.model.kinematics import ContactSet, contact_set, obstacle_candidates
@@ -50,7 +51,7 @@ class ScaledMechanics(eqx.Module):
         return self.mass * self.length**2
 
     @property
-    def force_unit(self) -> Float[Array, ""]:
+    def force_unit(self) -> Float[Array | np.number, ""]:
         """What one unit of force is in N, for times in seconds."""
         return self.mass * self.length
 

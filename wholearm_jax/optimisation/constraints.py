@@ -7,7 +7,7 @@ Derivation: section 9 of `docs/derivation.md`.
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -43,15 +43,10 @@ class Limits(eqx.Module):
     force_scale: Float[Array, "phases"]  # unit of forces [N]
 
 
-_PHASE_AXES: Any = {
-    "rate": False,
-    "shortest": True,
-    "longest": True,
-    "min_transition_speed": False,
-    "fixed_torques": True,
-    "force_scale": True,
-}
-HAS_PHASE_AXIS = Limits(**_PHASE_AXES)  # which limits have an entry a phase
+def _has_phase_axis(limits: Limits) -> Limits:
+    """Mark the limits that have an entry for each phase."""
+    marked = jax.tree.map(lambda _: True, limits)
+    return eqx.tree_at(lambda of: (of.rate, of.min_transition_speed), marked, (False, False))
 
 
 class ConstraintValues(NamedTuple):
@@ -89,7 +84,7 @@ def evaluate_constraints(
     phases, intervals = q.shape[:2]
     # Only the first interval of a phase has a least speed; -inf: it starts at rest.
     min_speed = jnp.zeros((phases, intervals)).at[:, 0].set(limits.min_transition_speed).at[0, 0].set(-jnp.inf)
-    of_phase, shared = eqx.partition(limits, HAS_PHASE_AXIS)
+    of_phase, shared = eqx.partition(limits, _has_phase_axis(limits))
 
     def one_phase(phase):
         q, min_speed, dynamics, of_phase = phase

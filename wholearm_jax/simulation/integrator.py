@@ -15,6 +15,7 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
@@ -38,7 +39,7 @@ class IntegratorOptions(eqx.Module):
     """
 
     solver: dfx.AbstractSolver = eqx.field(static=True, default=dfx.Dopri8())
-    tolerance: float | Float[Array, ""] = 1e-10
+    tolerance: float | Float[Array | np.ndarray, ""] = 1e-10
     max_steps: int = eqx.field(static=True, default=256)
     max_stages: int = eqx.field(static=True, default=8)
     has_jumps: bool = eqx.field(static=True, default=False)
