@@ -1,4 +1,4 @@
-"""Result files: torque schedules survive the round trip, bad ones are named by line, files are whole or absent."""
+"""Result files: trajectories and summaries are consistent, files are whole or absent."""
 
 import csv
 import json
@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from wholearm_jax.core.atomic_files import write_atomically
-from wholearm_jax.core.errors import SceneError
 from wholearm_jax.core.status import Status
-from wholearm_jax.files.results import read_torque, summary, write_summary, write_torque, write_trajectory
+from wholearm_jax.files.results import summary, write_summary, write_trajectory
 from wholearm_jax.files.scene_toml import load, parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan_simulation import simulate
@@ -46,77 +45,6 @@ def rows_of(path):
 
 def numbers(row, names):
     return np.array([float(row[name]) for name in names])
-
-
-# --- torque schedules ------------------------------------------------------------------------------------------------
-
-
-def test_torque_round_trip_is_exact(tmp_path):
-    values = np.random.default_rng(0).normal(size=(6, 2))
-    schedule = torque_schedule([0.0, 0.1, 1 / 3, 1 / 3, 2.0, 1e3 / 7], values)
-    path = tmp_path / "torque.csv"
-    write_torque(schedule, path)
-    assert path.read_text().splitlines()[0] == "t,tau1,tau2"
-    again = read_torque(path)
-    np.testing.assert_array_equal(again.times, schedule.times)
-    np.testing.assert_array_equal(again.values, values)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "t,tau1,tau2\r\n0,1,2\r\n1,3,4\r\n",
-        "\ufefft,tau1,tau2\n0,1,2\n1,3,4\n",
-        "tau2, t ,note,tau1\n2,0,a,1\n\n4,1,b,3\n",
-    ],
-    ids=["carriage returns", "byte order mark", "other columns and blank lines"],
-)
-def test_torque_files_from_elsewhere(text, tmp_path):
-    path = tmp_path / "torque.csv"
-    path.write_bytes(text.encode())
-    schedule = read_torque(path)
-    np.testing.assert_array_equal(schedule.times, [0, 1])
-    np.testing.assert_array_equal(schedule.values, [[1, 2], [3, 4]])
-
-
-BAD_TORQUE = {
-    "empty": ("", "line 1: the file is empty"),
-    "header only": ("t,tau1,tau2\n", "line 1: the file ends here: a torque schedule needs at least two rows"),
-    "one row": ("t,tau1,tau2\n0,1,2\n", "line 2: the file ends here: a torque schedule needs at least two rows"),
-    "no header": ("0,0,0\n1,0,0\n", "line 1: missing column t, tau1, tau2"),
-    "missing column": ("t,tau1\n0,0\n1,0\n", "line 1: missing column tau2"),
-    "not sorted": ("t,tau1,tau2\n0,0,0\n1,0,0\n0.5,0,0\n", "line 4: t = 0.5 follows 1: times must not decrease"),
-    "three times": ("t,tau1,tau2\n0,0,0\n1,0,0\n1,1,0\n1,2,0\n2,0,0\n", "line 5: t = 1 stands a third time"),
-    "not a number": ("t,tau1,tau2\n0,0,0\n1,much,0\n", "line 3: not three numbers: '1,much,0'"),
-    "short row": ("t,tau1,tau2\n0,0\n1,0,0\n", "line 2: not three numbers: '0,0'"),
-    "empty cell": ("t,tau1,tau2\n0,,0\n1,0,0\n", "line 2: not three numbers: '0,,0'"),
-    "two lines in one cell": ('t,tau1,tau2\n0,"a\nb",0\n1,0,0\n', "line 2: not three numbers"),
-    "NaN": ("t,tau1,tau2\n0,0,0\n1,nan,0\n", "line 3: not finite: '1,nan,0'"),
-    "infinity": ("t,tau1,tau2\n0,0,0\n1,0,-inf\n", "line 3: not finite: '1,0,-inf'"),
-    "infinite time": ("t,tau1,tau2\n0,0,0\n1e999,0,0\n", "line 3: not finite: '1e999,0,0'"),
-}
-
-
-@pytest.mark.parametrize(("text", "cause"), BAD_TORQUE.values(), ids=BAD_TORQUE.keys())
-def test_bad_torque_files_are_named_by_line(text, cause, tmp_path):
-    path = tmp_path / "torque.csv"
-    path.write_text(text)
-    with pytest.raises(SceneError) as caught:
-        read_torque(path)
-    message = str(caught.value)
-    assert message.startswith(f"{path}: {cause}")
-    assert "\n" not in message
-
-
-@pytest.mark.parametrize("kind", ["missing", "folder", "binary"])
-def test_unreadable_torque_files(kind, tmp_path):
-    path = tmp_path / "torque.csv"
-    if kind == "folder":
-        path.mkdir()
-    if kind == "binary":
-        path.write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(SceneError, match="no such file" if kind == "missing" else "cannot be read"):
-        read_torque(path)
 
 
 # --- trajectories and summaries --------------------------------------------------------------------------------------

@@ -6,13 +6,13 @@ from wholearm_jax.files.polygons_npz import count_polygons, read_polygons
 from wholearm_jax.files.results import (
     TRAJECTORY_COLUMNS,
     null_for_undefined,
-    read_torque,
     summary,
     write_summary,
     write_torque,
     write_trajectory,
 )
 from wholearm_jax.files.scene_toml import Positive, bundled, explain_validation_error, load, parse, save, to_dict
+from wholearm_jax.files.torque_csv import read_torque
 
 __all__ = [
     "EXECUTION_FILES",

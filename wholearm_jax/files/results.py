@@ -13,64 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from wholearm_jax.core import SceneError, write_atomically
+from wholearm_jax.core import write_atomically
 from wholearm_jax.files.scene_toml import CONSTRAINTS, to_dict
-from wholearm_jax.model import COORDINATES, TorqueSchedule, torque_schedule
+from wholearm_jax.files.torque_csv import TORQUE_COLUMNS
+from wholearm_jax.model import COORDINATES, TorqueSchedule
 from wholearm_jax.phases import Result, trajectory
 
-TORQUE_COLUMNS = ("t", "tau1", "tau2")
 _CONTACTS = range(1, CONSTRAINTS + 1)
 TRAJECTORY_COLUMNS = (
     *("t", "phase", *COORDINATES, *(f"{c}_dot" for c in COORDINATES), "tau1", "tau2"),
     *(f"cn{k}" for k in _CONTACTS),
     *(f"ct{k}" for k in _CONTACTS),
 )
-
-
-def read_torque(path: str | Path) -> TorqueSchedule:
-    """Read a torque schedule (header `t,tau1,tau2`; s, N m).
-
-    Raises `SceneError` naming the file, the line and the cause.
-
-    >>> wa.write_torque(wa.torque_schedule([0.0, 2.0], [[0.5, -0.2], [0.5, -0.4]]), folder / "torque.csv")
-    >>> wa.read_torque(folder / "torque.csv").values.tolist()
-    [[0.5, -0.2], [0.5, -0.4]]
-    """
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    except FileNotFoundError:
-        raise SceneError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    if not rows:
-        raise SceneError(f"{path}: line 1: the file is empty; it needs the header t,tau1,tau2 and at least two rows")
-    header = [name.strip() for name in rows[0]]
-    missing = [name for name in TORQUE_COLUMNS if name not in header]
-    if missing:
-        raise SceneError(f"{path}: line 1: missing column {', '.join(missing)}; the header is t,tau1,tau2")
-    places = [header.index(name) for name in TORQUE_COLUMNS]
-    numbers = []
-    for line, row in enumerate(rows[1:], start=2):
-        if not row:
-            continue
-        try:
-            values = [float(row[place]) for place in places]
-        except (ValueError, IndexError):
-            raise SceneError(f"{path}: line {line}: not three numbers: {','.join(row)!r:.60}") from None
-        if not all(map(math.isfinite, values)):
-            raise SceneError(f"{path}: line {line}: not finite: {','.join(row)!r:.60}")
-        if numbers and values[0] < numbers[-1][0]:
-            last = numbers[-1][0]
-            raise SceneError(f"{path}: line {line}: t = {values[0]:g} follows {last:g}: times must not decrease")
-        if len(numbers) > 1 and values[0] == numbers[-2][0]:
-            raise SceneError(f"{path}: line {line}: t = {values[0]:g} stands a third time; twice is a step")
-        numbers.append(values)
-    table = np.asarray(numbers).reshape(-1, 3)
-    try:
-        return torque_schedule(table[:, 0], table[:, 1:])
-    except ValueError as error:
-        raise SceneError(f"{path}: line {len(rows)}: the file ends here: {error}") from None
 
 
 def write_torque(schedule: TorqueSchedule, path: str | Path) -> None:
