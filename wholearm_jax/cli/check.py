@@ -22,7 +22,7 @@ from wholearm_jax.cli.arguments import (
     parse_ensemble,
     refuse_unwritable,
 )
-from wholearm_jax.cli.prediction import note_limit_violations
+from wholearm_jax.cli.prediction import note_doubtful_schedule
 from wholearm_jax.cli.processes import ProcessRank, join_processes, use_all_processors
 from wholearm_jax.cli.progress import count_progress
 from wholearm_jax.core import configure
@@ -109,7 +109,7 @@ def _read_schedule(scene, torque: Path, rank: ProcessRank):
     except ValueError as error:
         raise BadInput(f"{torque}: {error}") from None
     if rank.is_first:
-        note_limit_violations(scene, schedule, torque)
+        note_doubtful_schedule(scene, schedule, torque)
     return schedule
 
 

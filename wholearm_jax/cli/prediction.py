@@ -81,16 +81,20 @@ def simulate_or_exit(scene, schedule, torque: Path, tolerance: float, traced):
     """Simulate a plan under the schedule of file `torque`. Raises `BadInput` for a schedule that is too short."""
     from wholearm_jax.phases import simulate
 
-    note_limit_violations(scene, schedule, torque)
+    note_doubtful_schedule(scene, schedule, torque)
     try:
         return simulate(scene, schedule, tolerance=tolerance, traced=traced)
     except ValueError as error:
         raise BadInput(f"{torque}: {error}") from None
 
 
-def note_limit_violations(scene, schedule, torque: Path) -> None:
-    """Note where the schedule of file `torque` exceeds a joint's torque limit."""
+def note_doubtful_schedule(scene, schedule, torque: Path) -> None:
+    """Note that the schedule of file `torque` is much longer than its plan, or where it exceeds a torque limit."""
     from wholearm_jax.model import limit_violations
+    from wholearm_jax.phases import note_on_length
 
+    length = note_on_length(scene, schedule)
+    if length is not None:
+        note(f"{torque}: {length}")
     for joint, size, when, limit in limit_violations(schedule, scene.hand.torque_limit):
         note(f"{torque}: |tau{joint}| is {size:.4g} N m at t = {when:.4g} s, beyond the limit of {limit:.4g} N m")

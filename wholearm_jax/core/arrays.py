@@ -14,8 +14,20 @@ def eps_power(values: Array, power: float):
 
 def as_device_array(values, dtype=None) -> jax.Array:
     """Return `jnp.asarray(values)`; lists and numbers are moved without compiling a program for each shape."""
-    already_array = isinstance(values, jax.Array)
-    return jnp.asarray(values, dtype) if already_array else jax.device_put(np.asarray(values, dtype))
+    if isinstance(values, jax.Array) or is_traced(values):
+        return jnp.asarray(values, dtype)
+    return jax.device_put(np.asarray(values, dtype))
+
+
+def as_concrete_array(values, dtype=None) -> jax.Array:
+    """Return `as_device_array(values)`, an array that holds its numbers also where it is made within `jit`.
+
+    Numbers that are being transformed stay so.
+    """
+    if is_traced(values):
+        return as_device_array(values, dtype)
+    with jax.ensure_compile_time_eval():
+        return as_device_array(values, dtype)
 
 
 def as_strong_array(values, dtype):

@@ -51,6 +51,7 @@ from wholearm_jax.model.schedule import (
     PhaseSchedule,
     TorqueSchedule,
     concatenate_schedules,
+    find_schedule_defect,
     has_jumps,
     interval,
     limit_violations,

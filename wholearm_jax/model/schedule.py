@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core import as_device_array, is_traced, take_row
+from wholearm_jax.core import as_concrete_array, as_device_array, is_traced, take_row
 
 ROW_MULTIPLE = 128  # schedules are padded to a multiple of it, so that similar lengths share compiled programs
 TIME_ROUNDING = 16  # times that differ by this many units of machine epsilon are one
@@ -58,7 +58,7 @@ def torque_schedule(times, values) -> TorqueSchedule:
     Traceback (most recent call last):
     ValueError: times must not decrease, and none may stand more than twice: row 1 has t = 0 after 1
     """
-    schedule = TorqueSchedule(as_device_array(times, float), as_device_array(values, float))
+    schedule = TorqueSchedule(as_concrete_array(times, float), as_concrete_array(values, float))
     defect = find_schedule_defect(schedule)
     if defect is not None:
         raise ValueError(defect)
@@ -96,8 +96,10 @@ def uniform_schedule(duration, values) -> TorqueSchedule:
 
 
 def limit_violations(schedule: TorqueSchedule, limits) -> list[tuple[int, float, float, float]]:
-    """Return the joints whose torque exceeds its limit, rounding aside: number (1, 2), largest magnitude [N m], its time
-    [s], limit [N m]."""
+    """Return the joints whose torque exceeds its limit by more than rounding.
+
+    Each is `(number, magnitude [N m], time [s], limit [N m])` of its largest torque.
+    """
     times, sizes = np.asarray(schedule.times), np.abs(np.asarray(schedule.values))
     rows = sizes.argmax(0)
     largest = zip((1, 2), sizes[rows, [0, 1]].tolist(), times[rows].tolist(), np.asarray(limits).tolist(), strict=True)

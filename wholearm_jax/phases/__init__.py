@@ -6,7 +6,13 @@ from wholearm_jax.phases.gradients import check_gradient
 from wholearm_jax.phases.phase_ends import describe_end, final_configuration, statics_at_start, target_configuration
 from wholearm_jax.phases.phase_simulation import SimulatedPhase, precompile_simulation, simulate_phase
 from wholearm_jax.phases.phase_tracing import TracedPhase, trace_phase
-from wholearm_jax.phases.plan_schedule import has_torque_jumps, require_covered, require_motion, with_plan_step_capacity
+from wholearm_jax.phases.plan_schedule import (
+    has_torque_jumps,
+    note_on_length,
+    require_covered,
+    require_motion,
+    with_plan_step_capacity,
+)
 from wholearm_jax.phases.plan_simulation import (
     initial_carry,
     phase_inputs,

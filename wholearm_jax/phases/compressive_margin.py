@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.model import Arrival, Scene, TorqueSchedule
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
-from wholearm_jax.phases.plan_schedule import has_torque_jumps, with_plan_step_capacity
+from wholearm_jax.phases.plan_schedule import has_torque_jumps, require_followable, with_plan_step_capacity
 from wholearm_jax.phases.plan_simulation import simulate_phases
 from wholearm_jax.phases.plan_tracing import trace
 from wholearm_jax.simulation import IntegratorOptions
@@ -39,10 +39,15 @@ def margin(
         The margin [N]: negative where a contact would pull, `-inf` where a phase has no motion or no path. Whether the
         plan succeeds is for `simulate` to say.
 
+    Raises:
+        ValueError: For a schedule that is not finite or not sorted, naming the row, and for a plan that only holds its
+            object.
+
     >>> scene = wa.load("heptagon")
     >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")
     0.70 N
     """
+    require_followable(torque)
     jumps = options.has_jumps or has_torque_jumps(scene, torque)
     options = replace(with_plan_step_capacity(options, scene, torque), has_jumps=jumps)
     return plan_margin(scene, simulate_phases(scene, torque, trace(scene, resolution=resolution), options))

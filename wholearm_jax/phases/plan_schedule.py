@@ -3,8 +3,10 @@
 import numpy as np
 
 from wholearm_jax.core import is_traced
-from wholearm_jax.model import Arrival, Scene, TorqueSchedule, has_jumps
+from wholearm_jax.model import Arrival, Scene, TorqueSchedule, find_schedule_defect, has_jumps
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
+
+LONG_SCHEDULE = 1.5  # length of a schedule, over that of its plan, from which it is noted
 
 
 def require_motion(scene: Scene) -> None:
@@ -15,11 +17,32 @@ def require_motion(scene: Scene) -> None:
 
 
 def require_covered(scenes: Scene, torque: TorqueSchedule) -> None:
-    """Raise ValueError for a schedule that is shorter than the plan, or than the longest plan of stacked scenes."""
-    total = float(np.max(sum(np.asarray(p.duration) for p in scenes.phases)))
-    first, last = float(torque.times[0]), float(torque.times[-1])
+    """Raise ValueError for a schedule that cannot be followed, or is shorter than the (longest of stacked) plans."""
+    require_followable(torque)
+    total, first, last = _plan_duration(scenes), float(torque.times[0]), float(torque.times[-1])
     if first > 0 or last < total * (1 - 1e-9):
         raise ValueError(f"the torque schedule covers {first:g} to {last:g} s, the plan 0 to {total:g} s")
+
+
+def require_followable(torque: TorqueSchedule) -> None:
+    """Raise ValueError for a schedule that is not finite or not sorted, naming the row."""
+    defect = find_schedule_defect(torque)
+    if defect is not None:
+        raise ValueError(defect)
+
+
+def note_on_length(scene: Scene, torque: TorqueSchedule) -> str | None:
+    """Say that a schedule is much longer than its plan, and whether its unit may be the cause; None where it is not."""
+    total, last = _plan_duration(scene), float(torque.times[-1])
+    if last < LONG_SCHEDULE * total:
+        return None
+    hint = "; are its times in milliseconds?" if last > 100 * total else ""
+    return f"the torque schedule goes on to {last:g} s, {last / total:.3g} times the plan's {total:g} s{hint}"
+
+
+def _plan_duration(scenes: Scene) -> float:
+    """Return the duration [s] of a plan, or of the longest plan of stacked scenes."""
+    return float(np.max(sum(np.asarray(p.duration) for p in scenes.phases)))
 
 
 def with_plan_step_capacity(options: IntegratorOptions, scene: Scene, torque: TorqueSchedule) -> IntegratorOptions:
