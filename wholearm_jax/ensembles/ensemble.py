@@ -40,11 +40,11 @@ class Ensemble(eqx.Module):
         """Names of the numbers that vary, in the order of `draw_offsets`; padding rows of vertices are among them."""
         return tuple(name for quantity, _ in self.spreads for name in parameter_names(self.scene, quantity))
 
-    def draw(self, number: Int[Array, ""]) -> Scene:
+    def draw(self, number: int | Int[Array, ""]) -> Scene:
         """Draw scene number `number`."""
         return self.apply_offsets(self.draw_offsets(number))
 
-    def draw_offsets(self, number: Int[Array, ""]) -> Float[Array, "parameters"]:
+    def draw_offsets(self, number: int | Int[Array, ""]) -> Float[Array, "parameters"]:
         """Draw the offsets of scene `number`: one number in [-1, 1] per parameter, in units of its spread."""
         drawn = [jnp.zeros(0)]
         for quantity, _ in self.spreads:

@@ -27,7 +27,7 @@ class SceneSource(Protocol):
         """Whether all scenes have the same contact paths."""
         ...
 
-    def draw(self, number: Int[Array, ""]) -> Scene:
+    def draw(self, number: int | Int[Array, ""]) -> Scene:
         """Return scene number `number`."""
         ...
 
@@ -52,7 +52,7 @@ class SceneBatch(eqx.Module):
         """Number of scenes."""
         return self.scenes.object.mass.shape[0]
 
-    def draw(self, number: Int[Array, ""]) -> Scene:
+    def draw(self, number: int | Int[Array, ""]) -> Scene:
         """Return scene number `number`."""
         return jax.tree.map(lambda leaf: leaf[number], self.scenes)
 

@@ -68,7 +68,7 @@ def sign_with_deadband(values: Float[Array, "*shape"], tolerance) -> Float[Array
     return jnp.where(jnp.abs(values) > tolerance, jnp.sign(values), 0.0)
 
 
-def path_coordinate(curve: TracedCurve, chart: Int[Array, ""], z: Float[Array, "5"]) -> Float[Array, ""]:
+def path_coordinate(curve: TracedCurve, chart: int | Int[Array, ""], z: Float[Array, "5"]) -> Float[Array, ""]:
     """Compute `s` of a configuration by one of the curve's charts."""
     charts = curve.charts
     return charts.anchor_s[chart] + charts.direction[chart] @ (z - charts.anchor[chart])
