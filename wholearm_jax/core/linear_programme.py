@@ -76,7 +76,7 @@ class LinearProgramme:
     def _solve(self, name: str, sign: float) -> LinearProgrammeSolution | None:
         from scipy.optimize import linprog  # imported here: it takes long to import, and most plans need none
 
-        ends = np.cumsum([0, *map(len, self._bounds.values())])
+        ends = np.cumsum([0, *map(len, self._bounds.values())]).tolist()
         columns = {block: slice(*ends[k : k + 2]) for k, block in enumerate(self._bounds)}
         cost = np.zeros(ends[-1])
         cost[columns[name]] = sign
