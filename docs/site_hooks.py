@@ -16,6 +16,7 @@ OUTSIDE = (
     "notebooks/figures/*.png",
     "benchmarks/*.md",
     "benchmarks/results/*.svg",
+    "tests/*.md",
     "examples/*.py",
 )
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)

@@ -21,7 +21,7 @@ FOLDERS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
     *sorted(DOCS.rglob("*.md")),
-    *(ROOT / name / "README.md" for name in ("notebooks", "benchmarks")),
+    *(ROOT / name / "README.md" for name in ("notebooks", "benchmarks", "tests")),
 ]
 # What is made by, or given to, those that have one; and what takes long to compile and is tested by itself.
 WITHOUT_EXAMPLE = {"IntegratorOptions", "TorqueSchedule", "check"}
@@ -152,6 +152,19 @@ def test_pages_on_the_layout_name_every_folder():
     assert sorted(path.stem for path in (DOCS / "api").glob("*.md")) == sorted(["README", *FOLDERS])
 
 
+def test_the_table_of_places_names_functions_of_its_modules():
+    table = (DOCS / "architecture.md").read_text().split("## Where is")[1].split("\n## ")[0]
+    rows = re.findall(r"^\|[^|]*\|([^|]*)\|([^|]*)\|$", table, re.MULTILINE)
+    assert len(rows) >= 25
+    for modules, functions in rows[2:]:
+        paths = [PACKAGE / name for name in re.findall(r"`(\w+/\w+\.py)`", modules) if name != "cli/NAME.py"]
+        names = re.findall(r"`(\w+)`", functions)
+        assert paths
+        assert names
+        defined = {n.name for path in paths for n in ast.parse(path.read_text()).body if isinstance(n, ast.FunctionDef)}
+        assert set(names) <= defined, modules
+
+
 def test_files_that_documents_and_docstrings_cite_exist():
     """`tests/...`, `benchmarks/...`, `docs/...` in backticks, in pages and in the code; modules as `folder/name.py`."""
     cited = {
@@ -167,6 +180,7 @@ def test_files_that_documents_and_docstrings_cite_exist():
         (path, name)
         for path in PAGES
         for name in re.findall(rf"`((?:{package_folders})/[\w/]+\.py)`", path.read_text())
+        if not name.endswith("/NAME.py")
     }
     assert len(modules) >= 8
     assert [(str(path), name) for path, name in modules if not (PACKAGE / name).exists()] == []
