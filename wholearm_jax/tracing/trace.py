@@ -85,7 +85,7 @@ def trace_path(
     )
     reason, contact = _path_end(curve, mechanics.candidates.lower.shape[0])
     return ContactPath(
-        status=jnp.select(*map(list, zip(*refusals, strict=True)), int(Status.OK)),
+        status=jnp.select([c for c, _ in refusals], [status for _, status in refusals], int(Status.OK)),
         start=start,
         end=points.end,
         end_reason=reason,
@@ -106,4 +106,4 @@ def _path_end(curve: TracedCurve, candidates: int) -> tuple[Int[Array, ""], Int[
         (curve.end < candidates + 8, int(PathEnd.FEATURE_END)),
     )
     contact = jnp.where(curve.end < candidates, curve.end, (curve.end - candidates) % 4)
-    return jnp.select(*map(list, zip(*reasons, strict=True)), int(PathEnd.TARGET)), contact
+    return jnp.select([c for c, _ in reasons], [end for _, end in reasons], int(PathEnd.TARGET)), contact
