@@ -1,14 +1,19 @@
 """The command line: exit status 0 for ok, 1 for a plan that fails, 2 and one line for bad input."""
 
+import dataclasses
 import json
 import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import tomli_w
 
+from wholearm_jax.cli.output import write_result
 from wholearm_jax.files.scene_toml import bundled, load, to_dict
+from wholearm_jax.model.schedule import TorqueSchedule, torque_schedule
+from wholearm_jax.phases.plan_simulation import simulate
 
 
 @pytest.fixture
@@ -264,6 +269,28 @@ def test_an_until_that_is_not_on_the_wire_is_noted(wholearm, zero, scene_file):
     assert err.startswith(f"wholearm: note: {path}: phase[0].until: x = 5 is not on its wire, which leads from ")
     path = scene_file(lambda data: data.update(phase=[data["phase"][0] | {"until": {"x": 0.01}}]))
     assert wholearm("simulate", path, "--torque", zero)[2] == ""
+
+
+@pytest.mark.parametrize("record", ["ok", "stuck"])
+def test_a_plan_that_fails_does_not_take_the_place_of_one_that_is_ok(record, wholearm, zero, tmp_path):
+    for name, text in (("torque.csv", "old"), ("report.html", "old"), ("summary.json", f'{{"status": "{record}"}}')):
+        (tmp_path / name).write_text(text)
+    code, out, err = wholearm("simulate", "heptagon", "--torque", zero, "--out", tmp_path)
+    assert code == 1
+    stays = (tmp_path / "report.html").exists() and (tmp_path / "torque.csv").read_text() == "old"
+    assert stays == (record == "ok")
+    assert ("the result there is ok and stays" in err) == stays
+    assert (f"-> {tmp_path}" in out) != stays
+
+
+def test_a_result_without_torques_is_not_written(tmp_path, capsys):
+    """As of phases that are too fast for the torques."""
+    scene = load("heptagon")
+    plan = simulate(scene, torque_schedule([0.0, 2.0], np.zeros((2, 2))))
+    undefined = dataclasses.replace(plan, torque=TorqueSchedule(plan.torque.times, plan.torque.values * np.nan))
+    write_result(undefined, tmp_path, 5, as_json=False)
+    assert list(tmp_path.iterdir()) == []
+    assert "no torques were found; nothing is written" in capsys.readouterr().err
 
 
 def test_nothing_of_an_earlier_result_stays_in_a_folder(wholearm, zero, tmp_path):

@@ -37,7 +37,7 @@ def test_a_set_takes_the_place_of_the_earlier_one(folder):
         for name in ("torque.csv", "summary.json"):
             (scratch / name).write_text("new")
         assert contents(folder) == EARLIER
-    assert contents(folder) == {"torque.csv": "new", "summary.json": "new", "mine": "old"}
+    assert contents(folder) == {"torque.csv": "new", "summary.json": "new", "mine": "m"}
 
 
 @pytest.mark.parametrize("error", [OSError("full"), ValueError("NaN"), KeyboardInterrupt()])

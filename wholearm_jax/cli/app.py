@@ -6,8 +6,9 @@ Exit status 0 when the result is `ok`, 1 when the plan fails (its status is prin
 import gc
 import os
 import sys
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import typer
@@ -26,6 +27,23 @@ from wholearm_jax.core import configure, enable_program_cache
 UsageError: Any = typer.BadParameter.__mro__[1]  # of the library beneath, which Typer has under changing names
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+def _print_version(requested: bool) -> None:
+    if requested:
+        print(f"wholearm_jax {metadata.version('wholearm_jax')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version, and exit.")
+    ] = False,
+) -> None:
+    """Dynamics and torque optimisation of planar whole-arm manipulation."""
+
+
 for command in (check, scenes, optimise, simulate, formations, search, report, execute):
     app.command()(command)
 

@@ -26,6 +26,7 @@ Changes = Annotated[
     list[str] | None,
     typer.Option("--set", help="PHASE.duration=SECONDS; PHASE is a name or a number from 0. May be repeated."),
 ]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 Samples = Annotated[int, typer.Option(min=2, help="Rows a phase in trajectory.csv.")]
 
 

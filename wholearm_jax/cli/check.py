@@ -16,6 +16,7 @@ import typer
 from wholearm_jax.cli.arguments import (
     ARRIVAL_FRACTION,
     TORQUE_HELP,
+    AsJson,
     BadInput,
     SceneName,
     note,
@@ -55,6 +56,7 @@ def check(
     coordinator: Annotated[str | None, typer.Option(help="HOST:PORT of the first of several processes.")] = None,
     processes: Annotated[int | None, typer.Option(min=1, help="How many processes there are.")] = None,
     process: Annotated[int | None, typer.Option(min=0, help="Which of them this is, from 0.")] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Check a schedule against many variants of a scene; the same command goes on with a store it left unfinished."""
     if (polygons is None) == (count is None) or (polygons is None) != bool(vary):
@@ -77,7 +79,7 @@ def check(
     total = count if count is not None else int(source.scenes.object.mass.shape[0])  # pyright: ignore
     limits = {"arrival": None, "tolerance": None} if optimise else {"arrival": arrival, "tolerance": tolerance}
     settings = limits | {"optimise": knots if optimise else None, "seed": seed}
-    _run(_Job(source, schedule, settings, total, min(chunk, total), optimise, knots), loaded, out, rank)
+    _run(_Job(source, schedule, settings, total, min(chunk, total), optimise, knots), loaded, out, rank, as_json)
     sys.exit(0)
 
 
@@ -131,8 +133,9 @@ class _Job:
         return self.knots * len(self.source.draw(0).phases) if self.optimise else 0
 
 
-def _run(job: _Job, scene, out: Path, rank: ProcessRank) -> None:
+def _run(job: _Job, scene, out: Path, rank: ProcessRank, as_json: bool) -> None:
     """Fill the store with all other processes; the first process prints and writes the summary."""
+    from wholearm_jax.cli.tables import print_json
     from wholearm_jax.files.check_store import fingerprint, store_metadata
 
     digests = {"scenes": fingerprint(job.source), "torque": fingerprint(job.torque)}
@@ -141,7 +144,11 @@ def _run(job: _Job, scene, out: Path, rank: ProcessRank) -> None:
     _fill(store, job, rank)
     rank.wait_for_others("filled")
     if rank.is_first:
-        print("\n".join(_summarise(store, scene, job.source, out).lines))
+        lines, content = _summarise(store, scene, job.source, out)
+        if as_json:
+            print_json(content)
+        else:
+            print("\n".join(lines))
 
 
 def _open_shared_store(out: Path, metadata, job: _Job, rank: ProcessRank):
@@ -192,9 +199,9 @@ def _optimise_chunks(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]
     from wholearm_jax.optimisation import optimise
 
     def optimise_scene(number):
-        found = optimise(job.source.draw(number), knots=job.knots)
-        schedule = np.column_stack([np.asarray(found.torque.times), np.asarray(found.torque.values)])
-        return from_result(found.result), schedule
+        optimum = optimise(job.source.draw(number), knots=job.knots)
+        schedule = np.column_stack([np.asarray(optimum.torque.times), np.asarray(optimum.torque.values)])
+        return from_result(optimum.result), schedule
 
     with ThreadPoolExecutor(len(jax.local_devices())) as pool:
         for number in missing:
@@ -205,7 +212,7 @@ def _optimise_chunks(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]
 
 
 def _summarise(store, scene, source, out: Path):
-    """Summarise the store, and write the summary beside it: `NAME.json`, and figures."""
+    """Summarise the store, and write `NAME.json` and figures next to it; return the lines to print, and the content."""
     import json
 
     import jax
@@ -229,4 +236,4 @@ def _summarise(store, scene, source, out: Path):
         content = null_for_undefined(summary.as_dict() | more)
         write_atomically(scratch / files.record, json.dumps(content, indent=1, allow_nan=False) + "\n")
         save_figure(lambda: plot_ensemble(summary, more.get("influence"), mapped), scratch, out.stem)
-    return summary
+    return summary.lines, content

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from wholearm_jax.cli.arguments import (
+    AsJson,
     BadInput,
     SceneName,
     TorqueFile,
@@ -17,6 +18,7 @@ from wholearm_jax.cli.arguments import (
 from wholearm_jax.cli.output import may_replace
 from wholearm_jax.cli.prediction import simulate_or_exit, trace_or_exit
 from wholearm_jax.cli.progress import count_progress
+from wholearm_jax.cli.tables import print_json
 
 
 def execute(
@@ -33,6 +35,7 @@ def execute(
     mass: Annotated[str, typer.Option(help="Perturbation of the mass, e.g. 5%.")] = "5%",
     geometry: Annotated[float, typer.Option(min=0.0, help="Perturbation of the vertices [m].")] = 5e-4,
     start: Annotated[float, typer.Option(min=0.0, help="Perturbation of the start [m].")] = 5e-4,
+    as_json: AsJson = False,
 ) -> None:
     """Execute a torque schedule open loop on free bodies with soft contacts, in MuJoCo."""
     if video and out is None:
@@ -46,7 +49,7 @@ def execute(
         if error.name not in ("mujoco", "joblib"):
             raise
         raise BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
-    from wholearm_jax.files import EXECUTION_FILES, read_torque
+    from wholearm_jax.files import EXECUTION_FILES, execution_summary, read_torque
 
     schedule, amounts = read_torque(torque), Amounts(*fractions, geometry, start)
     if perturb:
@@ -56,20 +59,26 @@ def execute(
             raise BadInput(f"--{error}") from None
     folder = make_output_folder(out)
     prediction = simulate_or_exit(loaded, schedule, torque, 1e-10, trace_or_exit(scene, loaded))
-    print(f"predicted: {prediction.message}")
+    if not as_json:
+        print(f"predicted: {prediction.message}")
     try:
         require_wires(prediction)
-    except ValueError:
-        sys.exit(1)  # without a path there is no end to arrive at; the line above says why
+    except ValueError:  # without a path there is no end to arrive at; the prediction says why
+        if as_json:
+            print_json({"prediction": {"status": prediction.status.label, "message": prediction.message}})
+        sys.exit(1)
     settings = {"timestep": timestep, "tolerance": Tolerance(position, angle)}
     execution = rollout(prediction, **settings)
-    _print_events(execution)
     trials = _run_trials(prediction, perturb, amounts, seed=seed, **settings) if perturb else None
+    content = execution_summary(execution, trials, torque=str(torque))
     ok = execution.ending is ExecutionOutcome.OK
     folder = folder if folder and may_replace(folder, EXECUTION_FILES, ok) else None
     if folder is not None:
-        _write_execution(execution, trials, torque, folder, video)
-    print(f"executed: {execution.message}" + (f" -> {folder}" if folder else ""))
+        _write_execution(execution, content, folder, video)
+    if as_json:
+        print_json(content)
+    else:
+        _print_execution(execution, trials, folder)
     sys.exit(0 if ok else 1)
 
 
@@ -84,15 +93,18 @@ def _fraction(option: str, text: str) -> float:
     return fraction
 
 
-def _print_events(execution) -> None:
-    """Print when each contact was made or opened, predicted and executed."""
+def _print_execution(execution, trials, folder: Path | None) -> None:
+    """Print when each contact was made or opened, predicted and executed, how many trials succeed, and the outcome."""
     for contact, made, expected, executed in execution.events:
         times = " predicted, ".join("never" if t is None else f"{t:.4f} s" for t in (expected, executed))
         print(f"{contact} {'made' if made else 'opened'}: {times} executed")
+    if trials is not None:
+        print(trials.message)
+    print(f"executed: {execution.message}" + (f" -> {folder}" if folder else ""))
 
 
 def _run_trials(prediction, count: int, amounts, **settings):
-    """Execute perturbed objects with a progress bar, and print how many succeed."""
+    """Execute perturbed objects, with a progress bar."""
     from wholearm_jax.execution import ExecutionOutcome, run_trials
 
     with count_progress("{task.fields[succeed]} succeed") as progress:
@@ -103,18 +115,16 @@ def _run_trials(prediction, count: int, amounts, **settings):
             succeed += trial.ending is ExecutionOutcome.OK
             progress.update(bar, advance=1, succeed=succeed)
 
-        trials = run_trials(prediction, count, amounts, callback=show, **settings)
-    print(trials.message)
-    return trials
+        return run_trials(prediction, count, amounts, callback=show, **settings)
 
 
-def _write_execution(execution, trials, torque: Path, folder: Path, video: bool) -> None:
+def _write_execution(execution, content: dict, folder: Path, video: bool) -> None:
     """Write an execution's files."""
     from wholearm_jax.core import write_atomically
-    from wholearm_jax.files import EXECUTION_FILES, execution_summary, replace_files, write_execution, write_summary
+    from wholearm_jax.files import EXECUTION_FILES, replace_files, write_execution, write_summary
 
     with refuse_unwritable(f"--out {folder}"), replace_files(folder, EXECUTION_FILES) as scratch:
-        write_summary(execution_summary(execution, trials, torque=str(torque)), scratch / "execution.json")
+        write_summary(content, scratch / "execution.json")
         write_execution(execution, scratch / "execution.csv")
         write_atomically(scratch / "model.xml", execution.model_xml)
         _write_figures(execution, scratch, video)

@@ -1,17 +1,23 @@
-"""`wholearm formations`: the contact formations that can follow a configuration."""
+"""`wholearm formations`: the contact formations that can follow a configuration, or begin a plan."""
 
+import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from wholearm_jax.cli.arguments import BadInput, SceneName, load_scene, make_output_folder, phase_number
+from wholearm_jax.cli.arguments import AsJson, BadInput, SceneName, make_output_folder, phase_number, refuse_unwritable
 from wholearm_jax.cli.prediction import trace_or_exit
-from wholearm_jax.model import Arrival
+from wholearm_jax.cli.tables import Column, print_json, print_table
 
-LEGEND = """length: of the wire, in object radii; '-' and a status where none can be followed
+NEAR_TOL = 0.25  # gap at a start that is given roughly, in object radii, below which a contact may be meant
+LEGEND = """ends at, turn: the object's position and angle at the end, and by how much it turns
+length: of the wire, in object radii; '-' and a status where none can be followed
 static, bound: the best least contact force [N] with the object at rest there, and in a phase of 1 s
 enter at speed: what an object that arrives at speed keeps of it; 'pulls': a contact would have to pull"""
+TEXT_COLUMNS = ("contacts", "toward", "leads to")
+BEGIN_COLUMN = "begins at x, y mm"
+NUMBER_COLUMNS = ("ends at x, y mm", "phi deg", "turn deg", "length", "static N", "bound N", "enter at speed")
 
 
 def formations(
@@ -20,23 +26,43 @@ def formations(
     out: Annotated[
         Path | None, typer.Option(help="Folder for a picture of all ways: formations.png, .svg, .pdf.")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
-    """List the formations of four contacts that hold at a configuration, and where their wires lead."""
-    loaded = load_scene(scene)
-    folder = make_output_folder(out)
-    from wholearm_jax.planning import successor_formations
+    """List the formations that hold at a configuration, sliding and rolling, and where their wires lead.
 
-    z, z_dot = _configuration(loaded, trace_or_exit(scene, loaded), after)
-    successors = successor_formations(loaded, z, z_dot)
-    _print_table(loaded, z, successors)
+    The configuration is the end of a phase, or the start; in a scene without phases, what can begin near its start.
+    """
+    from wholearm_jax.files import load_start
+    from wholearm_jax.planning import successor_formations, touching_contacts
+
+    loaded = load_start(scene)
+    folder = make_output_folder(out)
+    if loaded.phases or after is not None:
+        z, z_dot = _configuration(loaded, trace_or_exit(scene, loaded), after)
+        touching, title = touching_contacts(loaded, z), "touching"
+        successors = successor_formations(loaded, z, z_dot, rolling=True)
+    else:
+        z, touching, title = loaded.start, touching_contacts(loaded, loaded.start, NEAR_TOL), "touching, or near"
+        successors = successor_formations(loaded, z, rolling=True, touching=touching)
+    if as_json:
+        print_json({"touching": touching, "formations": [_json_row(successor) for successor in successors]})
+    else:
+        begins = () if loaded.phases else (BEGIN_COLUMN,)
+        columns = [*map(Column, TEXT_COLUMNS), *(Column(name, True) for name in (*begins, *NUMBER_COLUMNS))]
+        rows = [_table_row(successor, bool(begins)) for successor in successors]
+        print_table(columns, rows, f"{title}: {', '.join(touching) or 'nothing'}", LEGEND)
     if folder is not None:
+        from wholearm_jax.files import FileSet, replace_files
         from wholearm_jax.plotting import plot_successors, save_figure
 
-        save_figure(lambda: plot_successors(loaded, z, successors), folder, "formations")
+        files = FileSet(None, (), ("formations",))
+        with refuse_unwritable(f"--out {folder}"), replace_files(folder, files) as scratch:
+            save_figure(lambda: plot_successors(loaded, z, successors), scratch, "formations")
 
 
 def _configuration(scene, traced, after: str | None):
     """Return configuration and exit velocity (None at rest): at the end of phase `after`, else at the plan's start."""
+    from wholearm_jax.model import Arrival
     from wholearm_jax.phases import target_configuration
     from wholearm_jax.planning import exit_velocity
 
@@ -50,19 +76,36 @@ def _configuration(scene, traced, after: str | None):
     return z, None if scene.phases[row].arrive is Arrival.HOLD else exit_velocity(traced[row].dynamics)
 
 
-def _print_table(scene, z, successors) -> None:
-    """Print a row for each successor, and the columns' meaning."""
-    from rich.console import Console
-    from rich.table import Table
+def _json_row(successor) -> dict[str, Any]:
+    """Return a successor in SI units, with its turn in degrees."""
+    import numpy as np
 
-    from wholearm_jax.planning import touching_contacts
+    from wholearm_jax.model import COORDINATES
 
-    table = Table(title=f"touching: {', '.join(touching_contacts(scene, z))}")
-    for column in ("contacts", "toward", "leads to", "length", "static N", "bound N", "enter at speed"):
-        table.add_column(column, justify="left" if column in ("contacts", "toward", "leads to") else "right")
-    for successor in successors:
-        forces = (f"{x:.3f}" if x > float("-inf") else "-" for x in (successor.static, successor.bound))
-        words = " ".join(successor.contacts), successor.toward, successor.ends
-        table.add_row(*words, f"{successor.length:.2f}", *forces, successor.entering)
-    Console().print(table)
-    print(LEGEND)
+    begin, end = np.asarray(successor.traced.begin), np.asarray(successor.end)
+    return {
+        "contacts": successor.contacts,
+        "toward": successor.toward,
+        "status": successor.status.label,
+        "ends": successor.ends,
+        "begin": dict(zip(COORDINATES, begin.tolist(), strict=True)),
+        "end": dict(zip(COORDINATES, end.tolist(), strict=True)),
+        "displacement": (end - begin)[:2].tolist(),
+        "turn_degrees": float(np.degrees(end[2] - begin[2])),
+        "length": successor.length,
+        "static": successor.static,
+        "bound": successor.bound,
+        "entering": successor.entering,
+    }
+
+
+def _table_row(successor, with_begin: bool) -> tuple[str, ...]:
+    """Return a successor's cells; dashes where its path could not be traced."""
+    row, is_traced = _json_row(successor), successor.status.value == 0
+    begin, end = (f"{1e3 * row[k]['x']:.1f}, {1e3 * row[k]['y']:.1f}" for k in ("begin", "end"))
+    angles = math.degrees(row["end"]["phi"]), row["turn_degrees"]
+    pose = (end, *(f"{round(angle, 1) + 0.0:.1f}" for angle in angles)) if is_traced else ("-",) * 3
+    forces = (f"{x:.3f}" if x > float("-inf") else "-" for x in (successor.static, successor.bound))
+    words = " ".join(successor.contacts), successor.toward, successor.ends
+    numbers = (*pose, f"{successor.length:.2f}", *forces, successor.entering)
+    return (*words, begin, *numbers) if with_begin else (*words, *numbers)

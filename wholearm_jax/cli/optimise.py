@@ -9,6 +9,7 @@ import typer
 
 from wholearm_jax.cli.arguments import (
     ARRIVAL_FRACTION,
+    AsJson,
     BadInput,
     Changes,
     OutputFolder,
@@ -42,6 +43,7 @@ def optimise(
     seed: Annotated[int, typer.Option(min=0, help="Of the varied scenes.")] = 0,
     arrival: Annotated[float, typer.Option(min=1e-9, max=1.0, help="As of `check`, for --robust.")] = ARRIVAL_FRACTION,
     report: Annotated[bool, typer.Option("--report", help="Also report.html, one page with an animation.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Find the torques with the largest compressive margin, and check them by simulation."""
     if report and out is None:
@@ -53,18 +55,25 @@ def optimise(
         unknown = [name for name, value in others if value is not None]
         if unknown:
             raise BadInput(f"--robust: knows no --{unknown[0]}")
-        _optimise_ensemble(parse_ensemble(loaded, robust, seed), folder, samples or 64, knots, steps, arrival, report)
+        ensemble = parse_ensemble(loaded, robust, seed)
+        _optimise_ensemble(ensemble, folder, samples or 64, knots, steps, arrival, report, as_json)
     from wholearm_jax.optimisation import MIN_TRANSITION_SPEED
 
     passing = MIN_TRANSITION_SPEED if passing is None else passing
     options = {"knots": knots, "steps": steps, "rate_limit": rate_limit, "passing": passing}
     begun = time.perf_counter()
-    found = _optimise_scene(scene, loaded, options)
-    more = {"command": "optimise", "knots": knots, "steps": len(found.history), "seconds": time.perf_counter() - begun}
-    more |= {"rate_limit": rate_limit, "passing": passing, "stopped": list(found.stopped)}
-    _print_optimised(found)
-    values = tuple(float(b.value) for b in found.bounds)
-    write_and_exit(found.result, folder, samples or 201, report=report, bounds=values, **more)
+    optimum = _optimise_scene(scene, loaded, options)
+    more = {
+        "command": "optimise",
+        "knots": knots,
+        "steps": len(optimum.history),
+        "seconds": time.perf_counter() - begun,
+    }
+    more |= {"rate_limit": rate_limit, "passing": passing, "stopped": list(optimum.stopped)}
+    if not as_json:
+        _print_optimised(optimum)
+    values = tuple(float(b.value) for b in optimum.bounds)
+    write_and_exit(optimum.result, folder, samples or 201, as_json, report=report, bounds=values, **more)
 
 
 def _optimise_scene(name: str, scene, options: dict):
@@ -82,16 +91,16 @@ def _optimise_scene(name: str, scene, options: dict):
             progress.update(bars[step.phase], completed=step.iteration + 1, state=state)
 
         progress.update(bars[0], state="compiling")
-        found = solve(scene, **options, callback=show, traced=traced)
-        for bar, reason in zip(bars, found.stopped, strict=True):
+        optimum = solve(scene, **options, callback=show, traced=traced)
+        for bar, reason in zip(bars, optimum.stopped, strict=True):
             progress.update(bar, completed=options["steps"], state=reason)
-    return found
+    return optimum
 
 
-def _print_optimised(found) -> None:
+def _print_optimised(optimum) -> None:
     """Print a line for each phase: message, bound, fraction of the bound reached, and why the solver stopped."""
     for phase, bound, fraction, reason in zip(
-        found.result.phases, found.bounds, found.bound_fraction, found.stopped, strict=True
+        optimum.result.phases, optimum.bounds, optimum.bound_fraction, optimum.stopped, strict=True
     ):
         ok = phase.status.value == 0 and 0 < fraction < float("inf")  # a failed plan may not come to the hard part
         reached = f", {100 * fraction:.1f} % of it reached" if ok else ""
@@ -99,7 +108,7 @@ def _print_optimised(found) -> None:
 
 
 def _optimise_ensemble(
-    ensemble, folder: Path | None, samples: int, knots: int, steps: int, arrival: float, report: bool
+    ensemble, folder: Path | None, samples: int, knots: int, steps: int, arrival: float, report: bool, as_json: bool
 ) -> None:
     """Optimise for an ensemble, print the scores, write the nominal scene's result, and exit."""
     from wholearm_jax.ensembles import optimise_robustly
@@ -117,17 +126,18 @@ def _optimise_ensemble(
             state = f"{100 * score.success_rate:.0f} % hold, worst {score.margin:.4f} N"
             progress.update(bar, completed=step + 1, state=state)
 
-        found = optimise_robustly(ensemble, samples=samples, knots=knots, steps=steps, arrival=arrival, callback=show)
-    for name, scores in (("sampled", found.in_sample), ("unseen", found.out_of_sample)):
+        optimum = optimise_robustly(ensemble, samples=samples, knots=knots, steps=steps, arrival=arrival, callback=show)
+    for name, scores in (("sampled", optimum.in_sample), ("unseen", optimum.out_of_sample)):
         nominal, robust = (f"{100 * s.success_rate:.1f} % hold, worst margin {s.margin:.4g} N" for s in scores)
-        print(f"{samples} {name} scenes: nominal {nominal}; robust {robust}")
-    result = simulate(ensemble.scene, found.torque, arrival=arrival)
-    nominal, robust = found.out_of_sample
+        if not as_json:
+            print(f"{samples} {name} scenes: nominal {nominal}; robust {robust}")
+    result = simulate(ensemble.scene, optimum.torque, arrival=arrival)
+    nominal, robust = optimum.out_of_sample
     more = {"command": "optimise --robust", "knots": knots, "steps": steps, "varied": samples, "arrival": arrival}
     amounts = (f"{name}={100 * a.size:g}%" if a.relative else f"{name}={a.size:g}" for name, a in ensemble.spreads)
     more |= {"robust": ", ".join(amounts), "seed": ensemble.seed}
     more |= {"unseen_share": robust.success_rate, "unseen_margin": robust.margin}
     more |= {"unseen_share_nominal": nominal.success_rate, "unseen_margin_nominal": nominal.margin}
     values = tuple(float(b.value) for b in bounds(ensemble.scene))
-    write_result(result, folder, 201, report, bounds=values, **more)
+    write_result(result, folder, 201, as_json, report, bounds=values, **more)
     sys.exit(0 if robust.success_rate == 1.0 else 1)

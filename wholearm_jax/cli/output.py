@@ -16,29 +16,34 @@ def print_phases(result) -> None:
             print(f"    {rest.message}")
 
 
-def write_and_exit(result, folder: Path | None, samples: int, report: bool = False, **more) -> NoReturn:
-    """Write the files, print the result's message, and exit with its status."""
-    write_result(result, folder, samples, report, **more)
+def write_and_exit(result, folder: Path | None, samples: int, as_json: bool, report: bool = False, **more) -> NoReturn:
+    """Write the files, print the result's message or the summary, and exit with its status."""
+    write_result(result, folder, samples, as_json, report, **more)
     sys.exit(0 if result.status.value == 0 else 1)
 
 
-def write_result(result, folder: Path | None, samples: int, report: bool = False, **more) -> None:
-    """Write the files in place of those of an earlier result, and print the result's message.
+def write_result(result, folder: Path | None, samples: int, as_json: bool, report: bool = False, **more) -> None:
+    """Write the files in place of those of an earlier result, and print the result's message or the summary.
 
     A result without torques is not written, and one that is not `ok` not over one that is: notes say so.
     """
     import numpy as np
 
-    from wholearm_jax.files import RESULT_FILES
+    from wholearm_jax.cli.tables import print_json
+    from wholearm_jax.files import RESULT_FILES, summary
 
+    content = summary(result, **more)
     if folder is not None and not np.isfinite(result.torque.values).all():
         note(f"--out {folder}: no torques were found; nothing is written")
         folder = None
     elif folder is not None and not may_replace(folder, RESULT_FILES, result.status.value == 0):
         folder = None
     if folder is not None:
-        _write_files(result, folder, samples, report, more)
-    print(result.message if not folder else f"{result.message} -> {folder}")
+        _write_files(result, content, folder, samples, report)
+    if as_json:
+        print_json(content)
+    else:
+        print(result.message if not folder else f"{result.message} -> {folder}")
 
 
 def may_replace(folder: Path, files, ok: bool) -> bool:
@@ -51,20 +56,14 @@ def may_replace(folder: Path, files, ok: bool) -> bool:
     return False
 
 
-def _write_files(result, folder: Path, samples: int, report: bool, more: dict) -> None:
-    from wholearm_jax.files import (
-        RESULT_FILES,
-        replace_files,
-        summary,
-        write_summary,
-        write_torque,
-        write_trajectory,
-    )
+def _write_files(result, content: dict, folder: Path, samples: int, report: bool) -> None:
+    """Write the files of a result and its figures."""
+    from wholearm_jax.files import RESULT_FILES, replace_files, write_summary, write_torque, write_trajectory
 
     with refuse_unwritable(f"--out {folder}"), replace_files(folder, RESULT_FILES) as scratch:
         write_torque(result.torque, scratch / "torque.csv")
         write_trajectory(result, scratch / "trajectory.csv", samples)
-        write_summary(summary(result, **more), scratch / "summary.json")
+        write_summary(content, scratch / "summary.json")
         _write_figures(result, scratch)
         if report:
             write_report(scratch, scratch / "report.html")

@@ -1,11 +1,19 @@
 """`wholearm search`: the paper's search for torques."""
 
-from wholearm_jax.cli.arguments import BadInput, OutputFolder, Samples, SceneName, load_scene, make_output_folder
+from wholearm_jax.cli.arguments import (
+    AsJson,
+    BadInput,
+    OutputFolder,
+    Samples,
+    SceneName,
+    load_scene,
+    make_output_folder,
+)
 from wholearm_jax.cli.output import print_phases, write_and_exit
 from wholearm_jax.cli.prediction import trace_or_exit
 
 
-def search(scene: SceneName, out: OutputFolder = None, samples: Samples = 201) -> None:
+def search(scene: SceneName, out: OutputFolder = None, samples: Samples = 201, as_json: AsJson = False) -> None:
     """The paper's search for torques by steps of 10 %."""
     loaded = load_scene(scene)
     folder = make_output_folder(out)
@@ -16,11 +24,12 @@ def search(scene: SceneName, out: OutputFolder = None, samples: Samples = 201) -
     traced = trace_or_exit(scene, loaded)
     wait_for(compiled)
     try:
-        found = search_by_steps(loaded, traced=traced)
+        optimum = search_by_steps(loaded, traced=traced)
     except ValueError as error:
         raise BadInput(f"{scene}: {error}") from None
-    print_phases(found.result)
-    print(f"{found.simulations} simulations in {found.seconds:.2f} s")
-    values = tuple(float(b.value) for b in bounds(found.result.scene, traced=traced))
-    more = {"simulations": found.simulations, "seconds": found.seconds}
-    write_and_exit(found.result, folder, samples, bounds=values, command="search", **more)
+    if not as_json:
+        print_phases(optimum.result)
+        print(f"{optimum.simulations} simulations in {optimum.seconds:.2f} s")
+    values = tuple(float(b.value) for b in bounds(optimum.result.scene, traced=traced))
+    more = {"simulations": optimum.simulations, "seconds": optimum.seconds}
+    write_and_exit(optimum.result, folder, samples, as_json, bounds=values, command="search", **more)

@@ -1,10 +1,12 @@
 """`wholearm simulate`: a plan under a given torque schedule."""
 
+from dataclasses import asdict
 from typing import Annotated
 
 import typer
 
 from wholearm_jax.cli.arguments import (
+    AsJson,
     Changes,
     OutputFolder,
     Samples,
@@ -27,6 +29,7 @@ def simulate(
     check_gradient: Annotated[
         bool, typer.Option("--check-gradient", help="Also the margin's derivatives: both modes against differences.")
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Simulate a plan under a given torque schedule."""
     loaded = load_scene(scene, set_)
@@ -41,30 +44,37 @@ def simulate(
     traced = trace_or_exit(scene, loaded)
     wait_for(compiled)
     result = simulate_or_exit(loaded, schedule, torque, tolerance, traced)
-    print_phases(result)
-    if check_gradient:
-        _print_gradient_check(loaded, schedule)
+    if not as_json:
+        print_phases(result)
+    gradient = _check_gradient(loaded, schedule, as_json) if check_gradient else {}
     values = tuple(float(b.value) for b in bounds(loaded, traced=traced))
-    more = {"command": "simulate", "torque": str(torque), "tolerance": tolerance}
-    write_and_exit(result, folder, samples, bounds=values, **more)
+    more = {"command": "simulate", "torque": str(torque), "tolerance": tolerance} | gradient
+    write_and_exit(result, folder, samples, as_json, bounds=values, **more)
 
 
-def _print_gradient_check(scene, schedule) -> None:
-    """Print the margin's directional derivatives by forward mode, reverse mode and finite differences."""
-    from rich.console import Console
-    from rich.table import Table
-
+def _check_gradient(scene, schedule, as_json: bool) -> dict:
+    """Compare the margin's directional derivatives: forward mode, reverse mode, differences; print them as a table."""
+    from wholearm_jax.cli.tables import Column, print_table
     from wholearm_jax.phases import check_gradient
 
     try:
         slopes = check_gradient(scene, schedule)
     except ValueError as error:
-        print(f"gradient: {error}")
-        return
-    table = Table(title="slope of the margin [N] along a random relative change of the inputs")
-    for column in ("inputs", "tolerance", "forward mode", "reverse mode", "differences", "give or take", ""):
-        table.add_column(column, justify="left" if column == "inputs" else "right", no_wrap=True)
-    for slope in slopes:
-        numbers = (f"{x:.10g}" for x in (slope.forward, slope.reverse, slope.differences))
-        table.add_row(slope.group, f"{slope.tolerance:.0e}", *numbers, f"{slope.uncertainty:.0e}", slope.finding)
-    Console(width=120).print(table)
+        if not as_json:
+            print(f"gradient: {error}")
+        return {"gradient": str(error)}
+    if not as_json:
+        names = ("tolerance", "forward mode", "reverse mode", "differences", "give or take")
+        rows = [
+            (
+                slope.group,
+                f"{slope.tolerance:.0e}",
+                *(f"{x:.10g}" for x in (slope.forward, slope.reverse, slope.differences)),
+                f"{slope.uncertainty:.0e}",
+                slope.finding,
+            )
+            for slope in slopes
+        ]
+        title = "slope of the margin [N] along a random relative change of the inputs"
+        print_table([Column("inputs"), *(Column(name, True) for name in names), Column("", True)], rows, title)
+    return {"gradient": [asdict(slope) | {"finding": slope.finding} for slope in slopes]}

@@ -11,7 +11,16 @@ from wholearm_jax.files.results import (
     write_torque,
     write_trajectory,
 )
-from wholearm_jax.files.scene_toml import Positive, bundled, explain_validation_error, load, parse, save, to_dict
+from wholearm_jax.files.scene_toml import (
+    Positive,
+    bundled,
+    explain_validation_error,
+    load,
+    load_start,
+    parse,
+    save,
+    to_dict,
+)
 from wholearm_jax.files.torque_csv import read_torque
 
 __all__ = [
@@ -26,6 +35,7 @@ __all__ = [
     "explain_validation_error",
     "is_ok",
     "load",
+    "load_start",
     "null_for_undefined",
     "parse",
     "read_polygons",

@@ -13,7 +13,7 @@ from wholearm_jax.core import write_together
 class FileSet(NamedTuple):
     """The files that a command may write into a folder, some of them on request only."""
 
-    record: str  # a JSON object with a `status`; there when the set is complete
+    record: str | None  # a JSON object with a `status`, there when the set is complete; None: figures alone
     others: tuple[str, ...]
     figures: tuple[str, ...]  # without their suffixes
 
@@ -43,7 +43,7 @@ def replace_files(folder: Path, files: FileSet) -> Iterator[Path]:
 def is_ok(folder: Path, files: FileSet) -> bool:
     """Return whether a folder holds a set whose record says `ok`."""
     try:
-        record = json.loads((folder / files.record).read_text(encoding="utf-8"))
+        record = json.loads((folder / (files.record or "")).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(record, dict) and record.get("status") == "ok"

@@ -7,6 +7,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import equinox as eqx
 import numpy as np
 import tomli_w
 from pydantic import (
@@ -198,9 +199,24 @@ def load(name: str | Path) -> Scene:
     Traceback (most recent call last):
     wholearm_jax.core.errors.SceneError: heptagn: no such file; did you mean the bundled scene 'heptagon'?
     """
+    return parse(_read_toml(name), str(name))
+
+
+def load_start(name: str | Path) -> Scene:
+    """Read a scene as `load` does; its phases may be missing."""
+    data = _read_toml(name)
+    if data.get("phase"):
+        return parse(data, str(name))
+    contacts = ["palm:v0", "palm:v1", "palm:v2", "finger1:v0"]  # which every polygon has
+    placeholder = {"name": "none", "contacts": contacts, "toward": "x-", "duration": 1.0}
+    return eqx.tree_at(lambda s: s.phases, parse(data | {"phase": [placeholder]}, str(name)), ())
+
+
+def _read_toml(name: str | Path) -> dict[str, Any]:
+    """Read the tables of a scene file. Raises `SceneError`."""
     if str(name) in bundled():
         text = (resources.files("wholearm_jax") / "scenes" / f"{name}.toml").read_text("utf-8")
-        return parse(tomllib.loads(text), str(name))
+        return tomllib.loads(text)
     path = Path(name)
     try:
         data = tomllib.loads(path.read_text("utf-8"))
@@ -212,7 +228,7 @@ def load(name: str | Path) -> Scene:
         raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     except (ValueError, RecursionError) as error:
         raise SceneError(f"{path}: not valid TOML: {error}") from None
-    return parse(data, str(path))
+    return data
 
 
 def parse(data: dict[str, Any], source: str = "scene") -> Scene:

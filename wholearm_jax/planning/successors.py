@@ -6,6 +6,7 @@ out. What remains is what a plan can do next.
 """
 
 import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -16,16 +17,16 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.core import Status, as_device_array
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel, resolve_impact
-from wholearm_jax.margin import MarginBound, best_quasistatic_torque, margin_upper_bound
+from wholearm_jax.margin import MAX_ROLLING, MarginBound, best_quasistatic_torque, margin_upper_bound
 from wholearm_jax.model import (
     COORDINATES,
     Phase,
     Scene,
+    constraint_jacobian,
     contact_candidates,
     contact_formation,
     contact_kinematics,
     contact_name,
-    normal_jacobian,
     path_target,
     rigid_body,
     scaled_mechanics,
@@ -75,58 +76,80 @@ def exit_velocity(dynamics: PathDynamics) -> Float[Array, "5"]:
     return evaluate(dynamics.velocity, panel, xi)
 
 
-def touching_contacts(scene: Scene, z: Float[Array, "5"]) -> tuple[str, ...]:
-    """Names of all contacts that touch at a configuration (SI)."""
+def touching_contacts(scene: Scene, z: Float[Array, "5"], tolerance: float = CONTACT_TOL) -> tuple[str, ...]:
+    """Return the names of all contacts that touch at a configuration (SI): a gap below `tolerance` object radii."""
     capacity = scene.object.vertices.shape[0]
     pairs = contact_candidates(capacity)
-    near = np.asarray(_near(scene, z, pairs))
+    near = np.asarray(_near(scene, z, pairs, tolerance))
     rows = zip(*(np.asarray(a)[near] for a in (pairs.link, pairs.kind, pairs.feature)), strict=True)
     return tuple(contact_name(*(int(v) for v in row)) for row in rows)
 
 
 @eqx.filter_jit
-def _near(scene, z, pairs):
+def _near(scene, z, pairs, slack):
     solid = rigid_body(scene.object)
     mechanics = scaled_mechanics(solid, scene.hand, scene.gravity, jax.tree.map(lambda a: a[:4], pairs))
     held = jax.tree.map(lambda a: a[: pairs.link.shape[0]], mechanics.candidates)
     at = contact_kinematics(held, z / mechanics.configuration_unit)
-    slack = CONTACT_TOL
     inside = (at.along >= held.lower - slack) & (at.along <= held.upper + slack)
-    return inside & (jnp.abs(at.gap) < CONTACT_TOL) & (pairs.feature < solid.count)
+    return inside & (jnp.abs(at.gap) < slack) & (pairs.feature < solid.count)
 
 
 def successor_formations(
-    scene: Scene, z: Float[Array, "5"], z_dot: Float[Array, "5"] | None = None
+    scene: Scene,
+    z: Float[Array, "5"],
+    z_dot: Float[Array, "5"] | None = None,
+    *,
+    rolling: bool = False,
+    touching: Sequence[str] | None = None,
 ) -> tuple[Successor, ...]:
-    """Every formation of four contacts that touch at `z` (SI), both ways, best static margin first.
+    """Return every formation of contacts that touch at a configuration, in both directions, best static margin first.
 
-    `z_dot` (SI) is the speed with which the object arrives there, if it does.
+    Args:
+        scene: the hand and the object.
+        z: configuration (SI).
+        z_dot: velocity (SI) with which the object arrives there, if it does.
+        rolling: whether to list formations with rolling contacts, too, each of which takes two of the four constraints.
+        touching: the contacts to combine, instead of those that touch at `z`: from each combination's nearest
+            configuration, as at the start of a plan. Those without one are left out.
     """
-    found = []
-    for four in itertools.combinations(touching_contacts(scene, z), 4):
-        chosen = contact_formation(four)
-        tangent = _tangent(scene, z, chosen)
+    contacts = touching_contacts(scene, z) if touching is None else touching
+    successors = []
+    for names in _combinations(contacts, rolling):
+        formation = contact_formation(names)
+        tangent = _path_direction(scene, z, formation)
         if tangent is None:
             continue
+        lists_failures = touching is None and not bool(np.any(formation.tangential))
         steepest = int(np.argmax(np.abs(tangent)))
         for sign in ("-", "+"):
-            way = _successor(scene, z, z_dot, four, chosen, COORDINATES[steepest] + sign)
-            if way is not None:
-                found.append(way)
-    return tuple(sorted(found, key=lambda way: -way.static))
+            successor = _successor(scene, z, z_dot, names, formation, COORDINATES[steepest] + sign)
+            if successor is not None and (successor.status is Status.OK or lists_failures):
+                successors.append(successor)
+    return tuple(sorted(successors, key=lambda successor: -successor.static))
 
 
-def _tangent(scene, z, chosen):
-    """The wire's direction in the object's units, or None where the four contacts do not fix one."""
-    rows = np.asarray(_rows(scene, z, chosen))
+def _combinations(contacts: Sequence[str], rolling: bool) -> Iterator[tuple[str, ...]]:
+    """Yield the combinations of contacts with four constraints: one for a sliding contact, two for a rolling one."""
+    yield from itertools.combinations(contacts, 4)
+    for count in range(1, MAX_ROLLING + 1) if rolling else ():
+        for rolls in itertools.combinations(contacts, count):
+            others = [name for name in contacts if name not in rolls]
+            for slides in itertools.combinations(others, 4 - 2 * count):
+                yield *(f"{name} rolling" for name in rolls), *slides
+
+
+def _path_direction(scene, z, formation):
+    """Return the path's direction in the object's units, or None where the constraints do not fix one."""
+    rows = np.asarray(_constraint_rows(scene, z, formation))
     _, values, right = np.linalg.svd(rows)
     return right[4] if values[-1] > WEDGING_CONDITION * values[0] else None
 
 
 @eqx.filter_jit
-def _rows(scene, z, chosen):
-    mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, chosen)
-    return normal_jacobian(mechanics.contacts, z / mechanics.configuration_unit)
+def _constraint_rows(scene, z, formation):
+    mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, formation)
+    return constraint_jacobian(mechanics.contacts, z / mechanics.configuration_unit)
 
 
 def _successor(scene, z, z_dot, names, chosen, toward: str) -> Successor | None:

@@ -72,7 +72,7 @@ def _bound_fraction(row: dict[str, Any]) -> str:
 
 def _settings(summary: dict[str, Any]) -> dict[str, str]:
     """Return how the result was made: the entries of the summary other than the result itself."""
-    others = {"status", "margin", "message", "phases", "scene", "stopped"}
+    others = {"status", "margin", "message", "phases", "scene", "stopped", "gradient"}
     return {SETTING_NAMES.get(k, k): _digits(v) for k, v in summary.items() if k not in others and v is not None}
 
 
