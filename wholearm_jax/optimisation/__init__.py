@@ -1,12 +1,9 @@
-"""Torque schedules with the largest margin: multiple shooting, interior point, Riccati recursion, the paper's
-search."""
+"""Torque schedules with the largest margin: multiple shooting, interior point, Riccati recursion, the paper's search.
 
-from wholearm_jax.optimisation.optimiser import (
-    MIN_TRANSITION_SPEED,
-    OptimisationResult,
-    bounds,
-    optimise,
-    precompile_optimise,
-    quasistatic,
-)
+`optimiser` explains how the parts work together.
+"""
+
+from wholearm_jax.optimisation.optimiser import MIN_TRANSITION_SPEED, OptimisationResult, optimise
+from wholearm_jax.optimisation.precompilation import precompile_optimise
+from wholearm_jax.optimisation.quasistatic_plan import bounds, quasistatic
 from wholearm_jax.optimisation.step_search import precompile_search, search_by_steps

@@ -1,8 +1,8 @@
-"""Group: phases that follow one another at speed are one problem, which is descended on from several starts.
+"""Coupled phases: phases that follow one another at speed are one problem, solved from several initial guesses.
 
-A group begins and ends at rest, or with the plan. Where torque rates are limited its first and last torques are those
-that it shares with its neighbours (`rest_transition`). What counts is not what the descent says of its intervals but an
-honest simulation of the schedules.
+A group of coupled phases begins and ends at rest, or with the plan. Where torque rates are limited its first and last
+torques are those that it shares with its neighbours (`rest_transition`). Solutions are compared by a simulation of
+their schedules, not by the samples of their intervals.
 
 Derivation: section 9 of `docs/derivation.md`.
 """
@@ -10,6 +10,7 @@ Derivation: section 9 of `docs/derivation.md`.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -38,17 +39,19 @@ from wholearm_jax.optimisation.variables import Variables
 from wholearm_jax.phases import TracedPhase, rest_intervals, simulate_phase
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
-TORQUE_SHARE = 0.9  # share of the torque limits that a start may use
-SHORTEST = 0.01  # share of its longest time that a phase moves at the least
-GOOD = 0.99  # share of the bound with which no further start is tried
+GUESS_TORQUE_FRACTION = 0.9  # of the torque limits, that an initial guess may use
+MIN_DURATION_FRACTION = 0.01  # of its longest duration, that a phase takes at least
+GOOD_BOUND_FRACTION = 0.99  # of the bound, with which no further guess is tried
+
+GroupSolution = tuple[list[TorqueSchedule], str, list[IterationRecord]]  # schedules from time 0, why it ended, records
 
 
 @dataclass(frozen=True)
 class OptimiseOptions:
-    """What `optimise` was asked for; `rows` is the size of the whole plan's schedule: those of one share programs."""
+    """Arguments of `optimise`."""
 
     knots: int
-    rows: int
+    schedule_rows: int  # of the whole plan's schedule: plans with equal rows share programs
     steps: int
     rate_limit: float | None
     durations: tuple[float, float] | None
@@ -60,102 +63,134 @@ class OptimiseOptions:
 
 @dataclass(frozen=True)
 class CoupledPhases:
-    """Phases with all that is known of them; `index` is the first one's number."""
+    """Phases that are solved together."""
 
-    index: int
+    index: int  # number of the first one
     phases: tuple[Phase, ...]
     traced: list[TracedPhase]
-    certificates: list[MarginBound]
-    begin: RestTransition | None  # where torque rates are limited, and a phase stands before
-    end: RestTransition | None  # or behind
-    wanted: OptimiseOptions
+    margin_bounds: list[MarginBound]
+    begin: RestTransition | None  # to the first phase, where torque rates are limited and another stands before
+    end: RestTransition | None  # from the last phase
+    options: OptimiseOptions
 
     @property
-    def pins(self) -> dict[tuple[int, int], np.ndarray]:
-        """Torques that stay as they are, in units of their limits, by phase and knot."""
-        begin = [] if self.begin is None else [((0, 0), self.begin, self.begin.departure_torque / self.limits[0])]
-        end = [] if self.end is None else [((-1, -1), self.end, self.end.torque / self.limits[-1])]
-        return {at: torque for at, change, torque in [*begin, *end] if change.is_feasible}
+    def fixed_torques(self) -> dict[tuple[int, int], np.ndarray]:
+        """Torques that stay, over their limits, by phase and knot."""
+        fixed = {}
+        if self.begin is not None and self.begin.is_feasible:
+            fixed[0, 0] = self.begin.departure_torque / self.torque_limits[0]
+        if self.end is not None and self.end.is_feasible:
+            fixed[-1, -1] = self.end.torque / self.torque_limits[-1]
+        return fixed
 
     @property
-    def most(self) -> float:
-        """The share of the bounds that the torques at both ends allow."""
-        changes = [
-            change.margin_fraction for change in (self.begin, self.end) if change is not None and change.is_feasible
-        ]
-        return min([1.0, *changes])
+    def best_possible(self) -> float:
+        """The fraction of the bounds that the torques at both ends allow."""
+        ends = (end for end in (self.begin, self.end) if end is not None and end.is_feasible)
+        return min([1.0, *(end.margin_fraction for end in ends)])
 
     @property
-    def lead(self) -> np.ndarray:
-        """How long the object waits in each phase before it sets out."""
+    def dwell_times(self) -> np.ndarray:
+        """How long the object waits in each phase before it starts [s]."""
         first = self.begin.dwell_time if self.begin is not None else 0.0
         return np.append(first, np.zeros(len(self.phases) - 1))
 
     @property
-    def durations(self) -> np.ndarray:
-        """How long it moves in each."""
-        return np.array([float(p.duration) for p in self.phases]) - self.lead
+    def moving_times(self) -> np.ndarray:
+        """How long it moves in each phase [s]."""
+        return np.array([float(p.duration) for p in self.phases]) - self.dwell_times
 
     @property
-    def limits(self) -> np.ndarray:
-        """The largest torques of each [N m]."""
-        return np.stack([np.asarray(at.dynamics.torque_limit) for at in self.traced])
+    def torque_limits(self) -> np.ndarray:
+        """Torque limits of each phase [N m]."""
+        return np.stack([np.asarray(path.dynamics.torque_limit) for path in self.traced])
 
     @property
     def bounds(self) -> np.ndarray:
-        return np.array([float(top.value) for top in self.certificates])
-
-    def problem(self, limits: Limits) -> Problem:
-        """What is descended on."""
-        phase_dynamics = stacked_tables([at.dynamics for at in self.traced])
-        return Problem(self.index, phase_dynamics, self.bounds, limits, self.wanted.steps, self.wanted.tolerance)
+        """Upper bound of each phase's margin [N]."""
+        return np.array([float(bound.value) for bound in self.margin_bounds])
 
 
-def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> tuple[list[TorqueSchedule], str, list[IterationRecord]]:
-    """Descend from one start after the other, until one comes near the bound or two agree.
+def group_phases(scene: Scene) -> list[list[int]]:
+    """Return the numbers of the phases in each group of those that follow one another at speed."""
+    groups, starts_at_rest = [], True
+    for index, phase in enumerate(scene.phases):
+        groups = [*groups, [index]] if starts_at_rest else [*groups[:-1], [*groups[-1], index]]
+        starts_at_rest = phase.arrive is not Arrival.MOVING
+    return groups
 
-    Returns the best schedules (each from time 0), why their descent stopped, and the steps taken.
+
+def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> GroupSolution:
+    """Solve from one initial guess after the other, until one comes near the bound or two agree.
+
+    Returns the best schedules, why their iterations ended, and the records of all iterations.
     """
-    wanted, tolerance = group.wanted, group.wanted.tolerance
-    for at in group.traced:
-        if int(at.dynamics.status) != Status.OK:
-            why = f"the wire cannot be followed: {Status(int(at.dynamics.status)).label}"
-            return [uniform_schedule(t, np.zeros((wanted.knots, 2))) for t in group.durations], why, []
-    begins = initial_guesses([at.dynamics for at in group.traced], group.durations, wanted.knots, TORQUE_SHARE)
+    options = group.options
+    for path in group.traced:
+        if int(path.dynamics.status) != Status.OK:
+            reason = f"the wire cannot be followed: {Status(int(path.dynamics.status)).label}"
+            return [uniform_schedule(t, np.zeros((options.knots, 2))) for t in group.moving_times], reason, []
+    phase_dynamics = [path.dynamics for path in group.traced]
+    guesses = initial_guesses(phase_dynamics, group.moving_times, options.knots, GUESS_TORQUE_FRACTION)
+    if (reason := _infeasible_reason(group)) is not None:
+        return _schedules(group, guesses[0]), reason, []
+
+    best, history = _solve_from_guesses(scene, group, guesses)
+    near_bound = best.is_ok and best.bound_fraction >= 1 - options.tolerance
+    reason = f"within {options.tolerance:g} of the bound" if near_bound else best.reason
+    return _schedules(group, best.p), reason, history
+
+
+class _Candidate(NamedTuple):
+    """A solution from one guess, as its simulation has it; the largest is the best."""
+
+    is_ok: bool
+    bound_fraction: float  # least margin over its bound
+    reason: str  # why iterations ended
+    p: Variables
+
+
+def _infeasible_reason(group: CoupledPhases) -> str | None:
+    """Return why no torques can solve the problem; None where some may."""
     weakest = int(np.argmin(group.bounds))
     if group.bounds[weakest] <= 0:
-        where = 100 * float(group.certificates[weakest].path_fraction)
-        why = f"no torque within limits holds this formation at {where:.0f} % of its wire"
-        return _schedules(group, begins[0]), why, []
+        percent = 100 * float(group.margin_bounds[weakest].path_fraction)
+        return f"no torque within limits holds this formation at {percent:.0f} % of its wire"
     if group.begin is not None and not group.begin.is_feasible:
-        return _schedules(group, begins[0]), "no torque lets this formation take over at the limited rate", []
-    problem = group.problem(_limits(group))
-    method = descent_method(wanted.optimiser, len(group.phases), extra_parts(problem.phase_dynamics))
-    found, history = [], []
-    for number, start in enumerate(begins):
-        for at, torque in group.pins.items():
-            start = eqx.tree_at(lambda p: p.torque, start, start.torque.at[at].set(torque))
-        ended = [other for fine, _, why, other in found if fine and why == CONVERGED]
-        p, why, taken = solve(problem, start, number, method, wanted.callback, ended)
-        history += taken
-        if why == REPEATED:
+        return "no torque lets this formation take over at the limited rate"
+    return None
+
+
+def _solve_from_guesses(
+    scene: Scene, group: CoupledPhases, guesses: list[Variables]
+) -> tuple[_Candidate, list[IterationRecord]]:
+    """Solve from guesses in turn; returns the best solution, and the records of all iterations."""
+    options, limits, stacked = group.options, _limits(group), stack_dynamics([path.dynamics for path in group.traced])
+    problem = Problem(group.index, stacked, group.bounds, limits, options.steps, options.tolerance)
+    method = solver_method(options.optimiser, len(group.phases), extra_parts(stacked))
+    candidates: list[_Candidate] = []
+    history: list[IterationRecord] = []
+    for number, guess in enumerate(guesses):
+        for at, torque in group.fixed_torques.items():
+            guess = eqx.tree_at(lambda p: p.torque, guess, guess.torque.at[at].set(torque))
+        solutions = [known.p for known in candidates if known.is_ok and known.reason == CONVERGED]
+        p, reason, records = solve(problem, guess, number, method, options.callback, solutions)
+        history += records
+        if reason == REPEATED:
             break
-        fine, share = _verify_by_simulation(scene, group, p)
-        best = max((other for ok, other, *_ in found if ok), default=np.nan)
-        agree = fine and abs(share - best) <= tolerance
-        found.append((fine, share, why, p))
-        if agree or (fine and share >= GOOD * group.most):
+        is_ok, fraction = _verify_by_simulation(scene, group, p)
+        best = max((known.bound_fraction for known in candidates if known.is_ok), default=np.nan)
+        candidates.append(_Candidate(is_ok, fraction, reason, p))
+        is_good = fraction >= GOOD_BOUND_FRACTION * group.best_possible
+        if is_ok and (is_good or abs(fraction - best) <= options.tolerance):
             break
-    fine, share, why, p = max(found, key=lambda one: one[:2])
-    if fine and share >= 1 - tolerance:
-        why = f"within {tolerance:g} of the bound"
-    return _schedules(group, p), why, history
+    return max(candidates, key=lambda known: known[:2]), history
 
 
 def _schedules(group: CoupledPhases, p: Variables) -> list[TorqueSchedule]:
-    """Each phase's schedule, from time 0."""
-    values, lengths = np.asarray(p.torque) * group.limits[:, None], np.exp(np.asarray(p.log_duration))
-    first, *others = [uniform_schedule(length, rows) for length, rows in zip(lengths, values, strict=True)]
+    """Return each phase's schedule, from time 0."""
+    values, times = np.asarray(p.torque) * group.torque_limits[:, None], np.exp(np.asarray(p.log_duration))
+    first, *others = [uniform_schedule(time, rows) for time, rows in zip(times, values, strict=True)]
     if group.begin is not None and group.begin.dwell_time > 0:
         times = np.append(0.0, group.begin.dwell_time + np.asarray(first.times))
         first = TorqueSchedule(as_device_array(times), as_device_array(np.vstack([group.begin.torque, first.values])))
@@ -163,40 +198,45 @@ def _schedules(group: CoupledPhases, p: Variables) -> list[TorqueSchedule]:
 
 
 def _verify_by_simulation(scene: Scene, group: CoupledPhases, p: Variables) -> tuple[bool, float]:
-    """Whether a simulation of the schedules says `ok`, holds included, and the least margin over its bound."""
-    start, shares, fine, incoming_velocity = 0.0, [], [], None
+    """Simulate the schedules: whether all phases are `ok`, rests included, and the least margin over its bound."""
+    start, fractions, is_ok, incoming_velocity = 0.0, [], [], None
     torque = concatenate_schedules(_schedules(group, p))
-    schedule, options = (
-        pad_schedule(torque, group.wanted.rows),
-        with_step_capacity(IntegratorOptions(), group.wanted.knots),
-    )
-    ends = np.cumsum(np.exp(np.asarray(p.log_duration)) + group.lead)
-    for phase, at, end, top in zip(group.phases, group.traced, ends, group.bounds, strict=True):
-        one = simulate_phase(at.dynamics, schedule, start, end - start, options, phase.arrive, incoming_velocity)
-        start += float(one.duration) * float(np.asarray(one.motion.phase_time)[int(one.motion.count)])
-        incoming_velocity = one.exit_velocity if phase.arrive is Arrival.MOVING else None
-        held = rest_intervals(scene, torque, phase, at, one)
-        fine.append(int(one.assessment.status) == Status.OK and all(h.loss_time is None for h in held))
-        shares.append(float(one.margin_result.margin) / top)
-    least = min(shares)
-    return all(fine), least if np.isfinite(least) else -np.inf
+    schedule = pad_schedule(torque, group.options.schedule_rows)
+    options = with_step_capacity(IntegratorOptions(), group.options.knots)
+    ends = np.cumsum(np.exp(np.asarray(p.log_duration)) + group.dwell_times)
+    for phase, path, end, bound in zip(group.phases, group.traced, ends, group.bounds, strict=True):
+        simulated = simulate_phase(
+            path.dynamics, schedule, start, end - start, options, phase.arrive, incoming_velocity
+        )
+        motion = simulated.motion
+        start += float(simulated.duration) * float(np.asarray(motion.phase_time)[int(motion.count)])
+        incoming_velocity = simulated.exit_velocity if phase.arrive is Arrival.MOVING else None
+        rests = rest_intervals(scene, torque, phase, path, simulated)
+        stays = all(rest.loss_time is None for rest in rests)
+        is_ok.append(int(simulated.assessment.status) == Status.OK and stays)
+        fractions.append(float(simulated.margin_result.margin) / bound)
+    least = min(fractions)
+    return all(is_ok), least if np.isfinite(least) else -np.inf
 
 
 def _limits(group: CoupledPhases) -> Limits:
-    lengths, asked = group.durations, group.wanted
-    shortest, longest = (lengths, lengths) if asked.durations is None else (t - group.lead for t in asked.durations)
-    rate = np.full(2, np.inf if asked.rate_limit is None else float(asked.rate_limit))
-    pinned = np.zeros((len(lengths), asked.knots), bool)
-    for at in group.pins:
-        pinned[at] = True
-    shortest, unit = np.maximum(shortest, SHORTEST * longest), np.maximum(group.bounds, 1e-300)
-    return Limits(*(as_device_array(a) for a in (rate, shortest, longest, np.asarray(asked.passing), pinned, unit)))
+    times, options = group.moving_times, group.options
+    shortest, longest = (times, times)
+    if options.durations is not None:
+        shortest, longest = (duration - group.dwell_times for duration in options.durations)
+    rate = np.full(2, np.inf if options.rate_limit is None else float(options.rate_limit))
+    is_fixed = np.zeros((len(times), options.knots), bool)
+    for at in group.fixed_torques:
+        is_fixed[at] = True
+    shortest, unit = np.maximum(shortest, MIN_DURATION_FRACTION * longest), np.maximum(group.bounds, 1e-300)
+    values = rate, shortest, longest, np.asarray(options.passing), is_fixed, unit
+    return Limits(*(as_device_array(a) for a in values))
 
 
 @functools.cache
-def descent_method(optimiser, phases: int, further: int):
-    """One transformation for every use, so that programs are not compiled again."""
-    return interior_point(phases, further) if optimiser is None else projected_gradient(optimiser)
+def solver_method(optimiser, phases: int, further_parts: int):
+    """Return one transformation for every use, so that programs are not compiled again."""
+    return interior_point(phases, further_parts) if optimiser is None else projected_gradient(optimiser)
 
 
-stacked_tables = jax.jit(stack_trees)
+stack_dynamics = jax.jit(stack_trees)
