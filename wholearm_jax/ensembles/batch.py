@@ -90,7 +90,7 @@ def check_in_chunks(
 
     `chunk_numbers` selects chunks and their order (default: all); the other arguments are those of `check`.
     """
-    require_x64()
+    require_x64(source.nominal, torque)
     require_positive(count=count, tolerance=tolerance, arrival=arrival, chunk=chunk)
     require_motion(source.nominal)  # holds need linear programmes, which compiled checks leave out
     require_covered(source.nominal, torque)

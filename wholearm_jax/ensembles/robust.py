@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from wholearm_jax.core import Status, require_positive
+from wholearm_jax.core import Status, require_positive, require_x64
 from wholearm_jax.ensembles.ensemble import Ensemble
 from wholearm_jax.ensembles.sampled_margins import SampledMargins, SampledScenes, margins_and_gradient, trace_samples
 from wholearm_jax.model import TorqueSchedule, limit_violations
@@ -84,6 +84,7 @@ def optimise_robustly(
             schedule that is shorter than the plan or beyond the torque limits.
     """
     scene, limit = ensemble.scene, ensemble.scene.hand.torque_limit
+    require_x64(scene)
     require_positive(samples=samples, knots=knots, steps=steps, arrival=arrival, rate=rate)
     require_motion(scene)
     start = optimise(scene, knots=knots).torque if nominal is None else nominal

@@ -1,7 +1,6 @@
 """Torque schedules with the largest margin: multiple shooting, interior point, Riccati recursion, the paper's search.
 
-`optimiser` explains how the parts work together.
-"""
+`optimiser` explains how the parts work together."""
 
 from wholearm_jax.optimisation.optimiser import MIN_TRANSITION_SPEED, OptimisationResult, optimise
 from wholearm_jax.optimisation.precompilation import precompile_optimise

@@ -128,7 +128,7 @@ def optimise(
     >>> optimum.result.status.label, [f"{fraction:.2f}" for fraction in optimum.bound_fraction]
     ('ok', ['1.00', '1.00'])
     """
-    require_x64()
+    require_x64(scene)
     require_knots(knots)
     require_positive(steps=steps, tolerance=tolerance, rate_limit=np.inf if rate_limit is None else rate_limit)
     if durations is not None and not 0 < durations[0] <= durations[1]:

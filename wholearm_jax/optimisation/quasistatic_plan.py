@@ -6,7 +6,7 @@ Derivation: section 8 of `docs/derivation.md`.
 import jax.numpy as jnp
 import numpy as np
 
-from wholearm_jax.core import CachedJit, Status, as_device_array
+from wholearm_jax.core import CachedJit, Status, as_device_array, require_x64
 from wholearm_jax.margin import MarginBound, margin_upper_bound
 from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, concatenate_schedules, uniform_schedule
 from wholearm_jax.optimisation.initial_guess import initial_guesses
@@ -31,10 +31,12 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[TracedPhase, ...
 
     Raises:
         ValueError: for fewer than two knots.
+        RuntimeError: without float64.
 
     >>> wa.quasistatic(wa.load("heptagon"), knots=11).values.shape
     (22, 2)
     """
+    require_x64(scene)
     require_knots(knots)
 
     def schedule(path, phase):
@@ -59,9 +61,13 @@ def bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[Margi
     Returns:
         One `MarginBound` a phase: `value` [N], and where on the path it is tight.
 
+    Raises:
+        RuntimeError: without float64.
+
     >>> [f"{float(bound.value):.3f} N" for bound in wa.bounds(wa.load("heptagon"))]
     ['0.966 N', '0.838 N']
     """
+    require_x64(scene)
     starts_at_rest = [True, *(p.arrive is not Arrival.MOVING for p in scene.phases[:-1])]
 
     def bound(path, phase, from_rest):

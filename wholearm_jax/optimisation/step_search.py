@@ -76,7 +76,7 @@ def search_by_steps(scene: Scene, *, longest: float = 10.0, traced: tuple[Traced
     >>> search.result.status.label, search.torque.values.shape
     ('ok', (4, 2))
     """
-    require_x64()
+    require_x64(scene)
     require_motion(scene)
     begun = time.perf_counter()
     if not traced:

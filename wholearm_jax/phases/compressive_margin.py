@@ -13,6 +13,8 @@ from wholearm_jax.phases.plan_tracing import trace
 from wholearm_jax.simulation import IntegratorOptions
 from wholearm_jax.tracing import Resolution
 
+MIN_FLOAT32_TOLERANCE = 1e-5  # of the integrator: float32 cannot meet less
+
 
 def margin(
     scene: Scene,
@@ -26,7 +28,7 @@ def margin(
     It is the minimum over time and contacts of `c_n` and, for contacts that roll, of `mu c_n - |c_t|`: the paper's
     `c_n > 0` (section 2.2; derivation, sections 4 and 7). Phases that hold the object do not count. Differentiable, in
     forward and reverse mode, with respect to the torques and every float of the scene. In float32 it has four digits
-    (`docs/accuracy.md`).
+    (`docs/accuracy.md`), and the integrator's tolerance is at least 1e-5.
 
     Args:
         scene: Scene with its plan.
@@ -50,7 +52,17 @@ def margin(
     require_followable(torque)
     jumps = options.has_jumps or has_torque_jumps(scene, torque)
     options = replace(with_plan_step_capacity(options, scene, torque), has_jumps=jumps)
+    if torque.times.dtype == jnp.float32:
+        options = _coarsen(options)
     return plan_margin(scene, simulate_phases(scene, torque, trace(scene, resolution=resolution), options))
+
+
+def _coarsen(options: IntegratorOptions) -> IntegratorOptions:
+    """Raise a tolerance that float32 cannot meet."""
+    tolerance = options.tolerance
+    number = isinstance(tolerance, float)
+    least = max(tolerance, MIN_FLOAT32_TOLERANCE) if number else jnp.maximum(tolerance, MIN_FLOAT32_TOLERANCE)
+    return replace(options, tolerance=least)
 
 
 def plan_margin(scene: Scene, simulated: tuple[SimulatedPhase, ...]) -> Float[Array, ""]:

@@ -60,7 +60,7 @@ def torque_gradient(
     >>> slope.shape
     (12, 2)
     """
-    require_x64()
+    require_x64(scene, torque)
     mode, jumps = choose_mode(torque), has_torque_jumps(scene, torque)
     options = IntegratorOptions(tolerance=tolerance, adjoint=mode, has_jumps=jumps)
     options = tolerance_as_data(with_plan_step_capacity(options, scene, torque), torque.times.dtype)
@@ -130,7 +130,7 @@ def check_gradient(
     Raises:
         ValueError: Where the plan has no margin to differentiate.
     """
-    require_x64()
+    require_x64(scene, torque)
     floats, rest = eqx.partition((scene, torque), eqx.is_inexact_array)
 
     def value(inputs, tolerance, adjoint):

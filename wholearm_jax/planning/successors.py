@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core import Status, as_device_array
+from wholearm_jax.core import Status, as_device_array, require_x64
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel, resolve_impact
 from wholearm_jax.margin import MAX_ROLLING, MarginBound, best_quasistatic_torque, margin_upper_bound
 from wholearm_jax.model import (
@@ -78,6 +78,7 @@ def exit_velocity(dynamics: PathDynamics) -> Float[Array, "5"]:
 
 def touching_contacts(scene: Scene, z: Float[Array, "5"], tolerance: float = CONTACT_TOL) -> tuple[str, ...]:
     """Return the names of all contacts that touch at a configuration (SI): a gap below `tolerance` object radii."""
+    require_x64(scene, z)
     capacity = scene.object.vertices.shape[0]
     pairs = contact_candidates(capacity)
     near = np.asarray(_near(scene, z, pairs, tolerance))
@@ -113,6 +114,7 @@ def successor_formations(
         touching: the contacts to combine, instead of those that touch at `z`: from each combination's nearest
             configuration, as at the start of a plan. Those without one are left out.
     """
+    require_x64(scene, z)
     contacts = touching_contacts(scene, z) if touching is None else touching
     successors = []
     for names in _combinations(contacts, rolling):
