@@ -78,7 +78,16 @@ def mechanics(scene: Scenes):
     solid = rigid_body(shape)
     solid = eqx.tree_at(lambda b: b.inertia, solid, jnp.where(scene.uniform, solid.inertia, scene.inertia))
     hand = Hand(
-        scene.joint, scene.length, scene.offset, scene.joint_inertia, scene.viscous, scene.dry, scene.torque_limit
+        joint=scene.joint,
+        length=scene.length,
+        offset=scene.offset,
+        back=jnp.zeros(2),
+        range=jnp.asarray([[-np.inf, np.inf]] * 2),
+        inertia=scene.joint_inertia,
+        viscous=scene.viscous,
+        dry=scene.dry,
+        torque_limit=scene.torque_limit,
+        layered=jnp.asarray(True),
     )
     formation = ContactFormation(scene.link, scene.kind, scene.feature, scene.tangential)
     heading = PathTarget(scene.coordinate, scene.sign, scene.until_coordinate, scene.until_value)

@@ -314,7 +314,7 @@ def test_a_vertex_stops_at_the_back_of_a_finger():
     notched = eqx.tree_at(lambda s: s.hand.length, notched, notched.hand.length.at[0].set(0.24942))
     traced = wa.trace(notched)[0]
     assert int(traced.dynamics.status) == wa.Status.OK
-    assert describe_end(traced, notched.phases[0], 16) == "finger1:v4 is made"
+    assert describe_end(notched, notched.phases[0], traced) == "finger1:v4 is made"
     side = np.subtract(lower[3], lower[4])  # from the rim to the bottom, where the tip is: along the finger at the end
 
     def across(z):
@@ -338,7 +338,7 @@ def test_the_hand_s_corners_stop_the_object(offset, corner):
     tipping = scene(block, contacts, "phi-", start, joint=(0.8, -0.8), length=2.5, offset=(offset, 0.0))
     traced = wa.trace(tipping)[0]
     assert int(traced.dynamics.status) == wa.Status.OK
-    assert describe_end(traced, tipping.phases[0], 8) == f"e1 meets {corner}"
+    assert describe_end(tipping, tipping.phases[0], traced) == f"e1 meets {corner}"
     x, y, phi, theta, _ = np.asarray(traced.end)
     met = np.array([0.8, 0.0]) + max(offset, 0.0) * np.array([-np.sin(theta), np.cos(theta)])
     across = np.array([np.cos(phi), np.sin(phi)]) @ (met - [x, y])

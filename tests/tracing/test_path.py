@@ -39,7 +39,7 @@ def test_starts_and_ends_touch(traced):
         path = at.path
         assert float(jnp.abs(gaps(formation.contacts, path.start)).max()) <= 1e-13
         assert float(jnp.abs(gaps(formation.contacts, path.end)).max()) <= 1e-12
-        assert describe_end(at, phase, scene.object.vertices.shape[0]) == end
+        assert describe_end(scene, phase, at) == end
         made = gaps(formation.candidates, path.end)[path.end_contact]
         assert abs(float(made)) <= 1e-10
 
@@ -175,7 +175,7 @@ def test_a_vertex_leaves_the_palm_where_it_ends(toward, contact, x):
     )
     (traced,) = wa.trace(scene)
     assert int(traced.dynamics.status) == wa.Status.OK
-    assert describe_end(traced, scene.phases[0], 8) == f"{contact} leaves its feature"
+    assert describe_end(scene, scene.phases[0], traced) == f"{contact} leaves its feature"
     z = np.asarray(traced.end)
     np.testing.assert_allclose(z[:3], [x, 0.03, 0.0], atol=1e-12)
 

@@ -23,6 +23,7 @@ class Status(enum.IntEnum):
     SINGULAR = 7
     NO_CONVERGENCE = 8
     MAX_STEPS = 9
+    OBSTACLE = 10
 
     @property
     def label(self) -> str:
@@ -45,5 +46,6 @@ _ADVICE = {
     Status.AMBIGUOUS: "friction allows both directions at once (Painleve); lower the friction or the squeeze",
     Status.SINGULAR: "rank is lost (wedging, fold, branch), or `toward` names a still coordinate; change the phase",
     Status.NO_CONVERGENCE: "Newton's method or the table did not converge; check the start, or refine the table",
+    Status.OBSTACLE: "links meet or a joint's range ends: end the phase before with `until`, or change the hand",
     Status.MAX_STEPS: "the step limit was reached; raise it, or shorten the phase",
 }

@@ -12,7 +12,7 @@ from wholearm_jax.dynamics.motion_equations import equations_of_motion
 from wholearm_jax.dynamics.path_dynamics import PathDynamics
 from wholearm_jax.dynamics.polynomials import fit_panels
 from wholearm_jax.model import ScaledMechanics, configuration_unit
-from wholearm_jax.tracing import ContactPath, path_derivatives
+from wholearm_jax.tracing import ContactPath, PathEnd, path_derivatives
 
 MAX_RELATIVE_CONDITION = 0.01  # largest condition number, over 1 / eps
 
@@ -65,6 +65,7 @@ def tabulate_path_dynamics(mechanics: ScaledMechanics, path: ContactPath) -> Pat
         rolling_friction=jnp.where(mechanics.contacts.tangential, mechanics.contacts.friction, 0.0),
         impact_map=impact_map * jnp.append(1.0, jnp.full(4, force))[:, None] / unit,
         torque_limit=mechanics.torque_limit,
+        ends_at_obstacle=path.end_reason == int(PathEnd.OBSTACLE),
         error=jnp.maximum(geometry_error, dynamics_error),
         condition=condition,
         status=jnp.where(path.status > 0, path.status, jnp.where(is_singular, int(Status.SINGULAR), 0)),

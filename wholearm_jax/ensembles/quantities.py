@@ -31,6 +31,8 @@ QUANTITIES = {
     "joint": Quantity(lambda s: s.hand.joint, tuple(f"{f} {c}" for f in FINGERS for c in "xy")),
     "length": Quantity(lambda s: s.hand.length, FINGERS, "positive"),
     "offset": Quantity(lambda s: s.hand.offset, FINGERS),
+    "back": Quantity(lambda s: s.hand.back, FINGERS, "not negative"),
+    "range": Quantity(lambda s: s.hand.range, tuple(f"{f} {end}" for f in FINGERS for end in ("least", "largest"))),
     "finger_inertia": Quantity(lambda s: s.hand.inertia, FINGERS, "positive"),
     "viscous": Quantity(lambda s: s.hand.viscous, FINGERS, "not negative"),
     "dry": Quantity(lambda s: s.hand.dry, FINGERS, "not negative"),
@@ -38,7 +40,7 @@ QUANTITIES = {
     "start": Quantity(lambda s: s.start, COORDINATES),
 }
 
-GEOMETRY = frozenset({"vertices", "center_of_mass", "joint", "length", "offset", "start"})
+GEOMETRY = frozenset({"vertices", "center_of_mass", "joint", "length", "offset", "back", "range", "start"})
 """Quantities on which contact paths depend."""
 
 

@@ -1,6 +1,7 @@
 """Scene files: TOML in and out, validated; every complaint names the file, the key and the cause."""
 
 import difflib
+import math
 import re
 import tomllib
 from importlib import resources
@@ -58,10 +59,18 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
+def _increasing(angles: tuple[float, float]) -> tuple[float, float]:
+    if angles[0] >= angles[1]:
+        raise ValueError("the least angle must be smaller than the largest")
+    return angles
+
+
 class _Finger(_Strict):
     joint: Pair
     length: Positive
     offset: Finite = 0.0
+    back: NonNegative = 0.0
+    range: Annotated[Pair, AfterValidator(_increasing)] = (0.0, math.pi)
     inertia: Positive
     viscous: NonNegative = 0.0
     dry: NonNegative = 0.0
@@ -71,6 +80,7 @@ class _Finger(_Strict):
 class _Hand(_Strict):
     finger1: _Finger
     finger2: _Finger
+    fingers: Literal["coplanar", "layered"] = "coplanar"
 
     @model_validator(mode="after")
     def _sides(self) -> "_Hand":
@@ -255,7 +265,10 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
     return Scene(
         title=checked.title,
         gravity=as_device_array(gravity),
-        hand=Hand(*(as_device_array([getattr(f, key) for f in fingers]) for key in Hand.__dataclass_fields__)),
+        hand=Hand(
+            **{key: as_device_array([getattr(f, key) for f in fingers]) for key in _Finger.model_fields},
+            layered=as_device_array(checked.hand.fingers == "layered"),
+        ),
         object=polygon(shape.vertices, shape.mass, each, shape.inertia, shape.center_of_mass),
         start=as_device_array([getattr(checked.start, c) for c in COORDINATES]),
         phases=tuple(
@@ -316,8 +329,10 @@ def _known_keys(location) -> list[str]:
 
 def to_dict(scene: Scene) -> dict[str, Any]:
     """A scene as nested dictionaries; the inverse of `parse`."""
-    fields = Hand.__dataclass_fields__
-    fingers = [{key: np.asarray(getattr(scene.hand, key))[k].tolist() for key in fields} for k in range(2)]
+    fingers = [
+        {key: np.asarray(getattr(scene.hand, key))[k].tolist() for key in _Finger.model_fields} for k in range(2)
+    ]
+    layers = "layered" if bool(scene.hand.layered) else "coplanar"
     shape = scene.object
     solid = {
         "vertices": np.asarray(shape.vertices)[: int(shape.count)].tolist(),
@@ -331,7 +346,7 @@ def to_dict(scene: Scene) -> dict[str, Any]:
     return {
         "title": scene.title,
         "gravity": np.asarray(scene.gravity).tolist(),
-        "hand": {"finger1": fingers[0], "finger2": fingers[1]},
+        "hand": {"fingers": layers, "finger1": fingers[0], "finger2": fingers[1]},
         "object": solid,
         "start": dict(zip(COORDINATES, np.asarray(scene.start).tolist(), strict=True)),
         "phase": [_phase_dict(phase) for phase in scene.phases],

@@ -1,9 +1,11 @@
 """What a scene is: polygon, hand, contact formation, contact kinematics, scaling, torque schedule."""
 
+from wholearm_jax.model.hand_collisions import LINK_OBSTACLES, LinkMeeting, link_obstacles, link_overlaps
 from wholearm_jax.model.kinematics import (
     FEATURE_GROUPS,
     FINGER_ROOT,
     PALM_END,
+    Carrier,
     ContactKinematics,
     ContactSet,
     anchor_rolling,
@@ -19,7 +21,6 @@ from wholearm_jax.model.kinematics import (
     gaps,
     normal_jacobian,
     slip_velocity,
-    slip_velocity_at,
     tangential_jacobian,
 )
 from wholearm_jax.model.mechanics import ScaledMechanics, configuration_unit, scaled_mechanics

@@ -44,6 +44,14 @@ Vector = tuple[Float[Array, "*contacts"], Float[Array, "*contacts"]]
 kernels that do nothing else."""
 
 
+class Carrier(eqx.Module):
+    """What carries the object's part of a contact, row by row: the object, or in its place a finger or the palm."""
+
+    object: Float[Array, "rows"]  # 1: the object
+    finger: Vector  # 1: finger 1, 2
+    base: Vector  # that finger's joint
+
+
 class ContactSet(eqx.Module):
     """Contacts as arrays; the leading axis runs over the constraints of a formation (`ContactFormation`).
 
@@ -67,6 +75,7 @@ class ContactSet(eqx.Module):
     tangential: Bool[Array, "rows"]
     slides: Bool[Array, "rows"]
     rolling_anchor: Float[Array, "rows"]
+    carrier: Carrier | None = None  # None: the object in every row
 
 
 class ContactKinematics(eqx.Module):
@@ -147,11 +156,11 @@ def contact_kinematics(contacts: ContactSet, z: Float[Array, "5"]) -> ContactKin
     """
     (px, py), (ex, ey), (jx, jy), (first, second) = contacts.point, contacts.edge, contacts.joint, contacts.finger
     cosines, sines = _cosines_and_sines(z[2:])
-    c, s = cosines[0], sines[0]
+    bx, by, c, s = _carrier_frame(contacts.carrier, z, cosines, sines)
     dx = (1 - first - second) + first * cosines[1] + second * cosines[2]  # along the link
     dy = first * sines[1] + second * sines[2]
     lx, ly = -contacts.side * dy, contacts.side * dx  # the link's normal
-    fx, fy = z[0] + c * px - s * py, z[1] + s * px + c * py  # the vertex (A) or the edge's start (B)
+    fx, fy = bx + c * px - s * py, by + s * px + c * py  # the vertex (A) or the edge's start (B)
     rx, ry = fx - jx, fy - jy
     tx = contacts.reach * dx + contacts.offset * lx - rx  # from there to the tip
     ty = contacts.reach * dy + contacts.offset * ly - ry
@@ -163,9 +172,19 @@ def contact_kinematics(contacts: ContactSet, z: Float[Array, "5"]) -> ContactKin
         gap=jnp.where(on, lx * rx + ly * ry - contacts.offset, -(nx * tx + ny * ty)),
         along=jnp.where(on, dx * rx + dy * ry, ex * tx + ey * ty),
         normal=(jnp.where(on, lx, nx), jnp.where(on, ly, ny)),
-        from_object=(wx - z[0], wy - z[1]),
+        from_object=(wx - bx, wy - by),
         from_joint=(wx - jx, wy - jy),
     )
+
+
+def _carrier_frame(carrier: Carrier | None, z, cosines, sines):
+    """Origin, cosine and sine of the frame of each row's object, or of what stands in its place."""
+    if carrier is None:
+        return z[0], z[1], cosines[0], sines[0]
+    body, (first, second), (jx, jy) = carrier.object, carrier.finger, carrier.base
+    c = (1 - body - first - second) + body * cosines[0] + first * cosines[1] + second * cosines[2]
+    s = body * sines[0] + first * sines[1] + second * sines[2]
+    return body * z[0] + jx, body * z[1] + jy, c, s
 
 
 @jax.custom_jvp
@@ -290,7 +309,11 @@ def _jacobian_along(contacts: ContactSet, at: ContactKinematics, direction: Vect
 def _velocity_along(contacts: ContactSet, at: ContactKinematics, direction: Vector, x) -> Float[Array, "rows"]:
     """Those rows times `x`."""
     ux, uy, turn, arm = _moment_arms(at, direction)
-    return ux * x[0] + uy * x[1] + turn * x[2] + arm * _link_rate(contacts, x)
+    if contacts.carrier is None:
+        return ux * x[0] + uy * x[1] + turn * x[2] + arm * _link_rate(contacts, x)
+    body, (first, second) = contacts.carrier.object, contacts.carrier.finger
+    rate = body * x[2] + first * x[3] + second * x[4]
+    return body * (ux * x[0] + uy * x[1]) + turn * rate + arm * _link_rate(contacts, x)
 
 
 def _link_rate(contacts: ContactSet, x: Float[Array, "5"]) -> Float[Array, "rows"]:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from wholearm_jax.model.hand_collisions import LinkObstacles, link_obstacles
 from wholearm_jax.model.kinematics import ContactSet, contact_set, obstacle_candidates
 from wholearm_jax.model.scene import EDGE, VERTEX, ContactFormation, Hand, RigidBody, next_vertex
 
@@ -23,7 +24,7 @@ class ScaledMechanics(eqx.Module):
     acceleration. `candidates` are all pairs that may touch, `exists` those of features that the object has;
     `may_terminate`
     marks those that could end the formation, `may_be_behind` vertices that may lie behind a link, whose back stops
-    them.
+    them. `links` are the gaps among the links of `hand`.
     `length` [m] and `mass` [kg] are the units; `torque_limit` stays in N m.
     """
 
@@ -32,6 +33,8 @@ class ScaledMechanics(eqx.Module):
     exists: Bool[Array, "candidates"]
     may_terminate: Bool[Array, "candidates"]
     may_be_behind: Bool[Array, "candidates"]
+    links: LinkObstacles
+    hand: Hand
     inertia: Float[Array, "5"]
     viscous: Float[Array, "2"]
     dry: Float[Array, "2"]
@@ -74,10 +77,13 @@ def scaled_mechanics(
         joint=hand.joint / length,
         length=hand.length / length,
         offset=hand.offset / length,
+        back=hand.back / length,
+        range=hand.range,
         inertia=hand.inertia / rotary,
         viscous=hand.viscous / rotary,
         dry=hand.dry / rotary,
         torque_limit=hand.torque_limit,
+        layered=hand.layered,
     )
     pairs = obstacle_candidates(body.vertices.shape[0])
     touchable = pairs.feature < body.count
@@ -88,6 +94,8 @@ def scaled_mechanics(
         exists=touchable,
         may_terminate=touchable & ~_coincides_with_contact(pairs, formation, body.count),
         may_be_behind=_may_be_behind(pairs, formation, _is_convex(body)),
+        links=link_obstacles(small_hand),
+        hand=small_hand,
         inertia=jnp.concatenate([heavy, small_hand.inertia]),
         viscous=small_hand.viscous,
         dry=small_hand.dry,

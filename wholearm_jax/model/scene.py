@@ -51,17 +51,20 @@ class Polygon(eqx.Module):
 class Hand(eqx.Module):
     """A palm on `y = 0` and two single-link fingers; row 0 of each array is finger 1, row 1 finger 2.
 
-    `joint` [m], `length` [m], `offset` of the contact edge from the joint axis toward the object [m], and the joint
-    parameters of eq. (1): `inertia` J [kg m^2], `viscous` B [N m s], `dry` D [N m], `torque_limit` [N m].
+    A finger is the strip from its contact edge, `offset` from the joint axis toward the object, to its back, `back`
+    from the axis on the other side; both are 0 for a segment.
     """
 
-    joint: Float[Array, "2 2"]
-    length: Float[Array, "2"]
-    offset: Float[Array, "2"]
-    inertia: Float[Array, "2"]
-    viscous: Float[Array, "2"]
-    dry: Float[Array, "2"]
-    torque_limit: Float[Array, "2"]
+    joint: Float[Array, "2 2"]  # [m]
+    length: Float[Array, "2"]  # [m]
+    offset: Float[Array, "2"]  # [m]
+    back: Float[Array, "2"]  # [m]
+    range: Float[Array, "2 2"]  # least and largest joint angle [rad]
+    inertia: Float[Array, "2"]  # J of eq. (1) [kg m^2]
+    viscous: Float[Array, "2"]  # B [N m s]
+    dry: Float[Array, "2"]  # D [N m]
+    torque_limit: Float[Array, "2"]  # [N m]
+    layered: Bool[Array, ""]  # whether the fingers lie in planes of their own and pass each other
 
 
 class ContactFormation(eqx.Module):

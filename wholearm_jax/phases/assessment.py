@@ -39,7 +39,8 @@ def assess_phase(
     """Decide the status of a phase from the earliest trouble.
 
     In order of precedence: a path that cannot be traced, an impulse that would pull or throw the object back at entry,
-    a tensile force, then how the motion ended. A phase that holds the object fails when it departs: `reversed`
+    a tensile force, then how the motion ended; a path that ends at an obstacle of the hand is not ok. A phase that
+    holds the object fails when it departs: `reversed`
     backward, `not_reached` forward in the direction in which its path was traced.
 
     Args:
@@ -84,7 +85,8 @@ def _assess_arrival(dynamics: PathDynamics, motion: Motion, at_rest, arrival) ->
     stopped = (ended == Status.STUCK) | ((ended == Status.REVERSED) & is_late)
     arrived = is_near & (reached | stopped) & (is_slow | ~at_rest)
     failure = jnp.where(ended == Status.OK, int(Status.NOT_REACHED), ended)
-    return jnp.where(arrived, int(Status.OK), failure)
+    arrival_status = jnp.where(dynamics.ends_at_obstacle, int(Status.OBSTACLE), int(Status.OK))
+    return jnp.where(arrived, arrival_status, failure)
 
 
 def _assess_hold(motion: Motion) -> tuple[Int[Array, ""], Float[Array, ""]]:

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Int
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.margin import RestAccelerations, Statics, contact_statics
 from wholearm_jax.model import FEATURE_GROUPS, FINGER_ROOT, PALM_END, Arrival, Phase, Scene, contact_name
+from wholearm_jax.phases.obstacles import describe_obstacle
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.simulation import Motion
 from wholearm_jax.tracing import PathEnd
@@ -46,13 +47,13 @@ def statics_at_start(scene: Scene, phase: Phase, traced: TracedPhase) -> tuple[S
     return statics, RestAccelerations(forward[[0, 3, 4]], backward)
 
 
-def describe_end(traced: TracedPhase, phase: Phase, capacity: int) -> str:
-    """Say why a phase ends; `capacity` is the number of rows of the object's vertices."""
+def describe_end(scene: Scene, phase: Phase, traced: TracedPhase) -> str:
+    """Say why a phase's path ends."""
     if phase.arrive is Arrival.HOLD:
         return "the object is held"
     reason, index = int(traced.path.end_reason), int(traced.path.end_contact)
     if reason == PathEnd.CONTACT_MADE:
-        group, feature = divmod(index, capacity)
+        group, feature = divmod(index, scene.object.vertices.shape[0])
         link, kind = FEATURE_GROUPS[group]
         if kind == FINGER_ROOT:
             return f"e{feature} meets finger{link}'s root"
@@ -61,4 +62,6 @@ def describe_end(traced: TracedPhase, phase: Phase, capacity: int) -> str:
         return f"{contact_name(link, kind, feature)} is made"
     if reason == PathEnd.FEATURE_END:
         return f"{phase.formation.names[phase.formation.contact_of_row[index]]} leaves its feature"
+    if reason == PathEnd.OBSTACLE:
+        return describe_obstacle(scene, traced.end, index)
     return "the phase's own limit is reached" if reason == PathEnd.TARGET else "no end was found"

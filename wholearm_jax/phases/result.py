@@ -11,7 +11,8 @@ import numpy as np
 from wholearm_jax.core import Status
 from wholearm_jax.margin import RestInterval, contact_statics, rest_margin
 from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule
-from wholearm_jax.phases.phase_ends import configuration
+from wholearm_jax.phases.obstacles import describe_refused_start
+from wholearm_jax.phases.phase_ends import configuration, describe_end
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.phase_tracing import TracedPhase
 
@@ -24,7 +25,7 @@ class PhaseResult:
     """A simulated phase, readable: times in seconds from the plan's start, contacts by name, forces in newtons.
 
     `time` is when the phase ended or failed. A phase that is entered while moving begins at `start` with `impulses`
-    [N s], one a contact.
+    [N s], one a contact. `detail` names what is in the way where the phase cannot begin, or ends at an obstacle.
     `slip_velocity` says that the contact lost is one that should roll, and that it leaves its friction cone.
     `margin` is the least force while the object moves; while friction holds it at rest forces are not determined, and
     `best_quasistatic_torque_batch` says what the contacts can do. A phase that only holds has the margin of its hold.
@@ -47,6 +48,7 @@ class PhaseResult:
     holds: tuple[RestInterval, ...]
     traced: TracedPhase
     outcome: SimulatedPhase
+    detail: str | None = None
 
     @property
     def message(self) -> str:
@@ -55,6 +57,7 @@ class PhaseResult:
             return f"{self.name}: ok, margin {self.margin:.4g} N at {self.margin_contact}, t = {self.margin_time:.4g} s"
         whose = f" at {self.contact}" if self.contact else ""
         advice = SLIP_TOL if self.slips else self.status.advice
+        advice = f"{self.detail}; {advice}" if self.detail else advice
         rests = self.status is Status.STUCK and self.holds
         since = f", at rest since {self.holds[-1].start:.6g} s" if rests else ""
         return f"{self.name}: {self.status.label}{whose}, t = {self.time:.6g} s{since}: {advice}"
@@ -123,9 +126,18 @@ def build_result(scene: Scene, torque: TorqueSchedule, traced, found) -> Result:
             holds=rest_intervals(scene, torque, phase, at, outcome),
             traced=at,
             outcome=outcome,
+            detail=_detail(scene, phase, at, Status(int(assessment.status))),
         )
         rows.append(_with_holds(one))
     return Result(scene, torque, tuple(rows))
+
+
+def _detail(scene: Scene, phase: Phase, traced: TracedPhase, status: Status) -> str | None:
+    """Name what is in the way of a phase."""
+    refused = int(traced.path.status)
+    if refused in (Status.LEFT_FORMATION, Status.OBSTACLE):
+        return describe_refused_start(scene, phase, traced.begin)
+    return describe_end(scene, phase, traced) if status is Status.OBSTACLE else None
 
 
 def rest_intervals(

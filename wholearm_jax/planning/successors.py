@@ -173,7 +173,7 @@ def _successor(scene, z, z_dot, names, chosen, toward: str) -> Successor | None:
         toward=toward,
         status=status,
         length=length,
-        ends=describe_end(traced, phase, scene.object.vertices.shape[0]) if known else status.label,
+        ends=describe_end(scene, phase, traced) if known else status.label,
         end=traced.end,
         static=static,
         bound=top,

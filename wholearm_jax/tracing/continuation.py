@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import Status, eps_power, set_row
-from wholearm_jax.model import PathTarget, ScaledMechanics
+from wholearm_jax.model import ScaledMechanics
 from wholearm_jax.tracing.curve import Chart, Node, TracedCurve, reversal_functions, sign_with_deadband
-from wholearm_jax.tracing.events import EventFunctions, EventValues, detect_events, event_functions
+from wholearm_jax.tracing.events import EventFunctions, EventValues, detect_events, first_event
 from wholearm_jax.tracing.path_root import newton_corrector
 
 MAX_CONTINUATION_STEP = 0.06  # [object radii or radians]
@@ -82,18 +82,18 @@ class _Outcome(NamedTuple):
 
 
 def trace_curve(
-    mechanics: ScaledMechanics, target: PathTarget, z: Float[Array, "5"], x: Float[Array, "5"], max_nodes: int
+    mechanics: ScaledMechanics, events: EventFunctions, z: Float[Array, "5"], x: Float[Array, "5"], max_nodes: int
 ) -> TracedCurve:
     """Follow a formation's curve from `z` along its unit tangent `x` to its end.
 
     Args:
         mechanics: the formation in object units.
-        target: where to stop before the formation ends.
+        events: what ends the path (`event_functions`).
         z: a configuration on the curve (5,).
         x: the unit tangent there (5,).
         max_nodes: if so many nodes do not reach the end, the status is `max_steps`.
     """
-    events, tolerance = event_functions(mechanics, target, z), eps_power(z, 5 / 8)
+    tolerance = eps_power(z, 5 / 8)
 
     def step(state: _ContinuationState) -> _ContinuationState:
         trial = _try_step(mechanics, events, tolerance, state)
@@ -233,7 +233,7 @@ def _bracket_end(events: EventFunctions, state: _ContinuationState, tolerance) -
     last, trial = state.last, state.trial
     step = jnp.where(state.status == 0, trial.s - last.s, 1.0)
     crossed, fraction = detect_events(events, state.events, state.trial_events, step, tolerance)
-    first = jnp.argmin(jnp.where(crossed, fraction, jnp.inf))
+    first = first_event(crossed, fraction)
     has_end = (state.status == 0) & jnp.any(crossed)
     start = state.nodes.z[0]
     return TracedCurve(

@@ -11,9 +11,10 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import eps_power, take_row
-from wholearm_jax.model import PathTarget, ScaledMechanics, contact_kinematics, slip_velocity_at
+from wholearm_jax.model import ScaledMechanics, slip_velocity
 from wholearm_jax.tracing.continuation import BRACKET_STEP
 from wholearm_jax.tracing.curve import TracedCurve, oriented_tangent, path_coordinate
+from wholearm_jax.tracing.events import EventFunctions
 from wholearm_jax.tracing.path_root import solve_on_path
 
 
@@ -35,26 +36,33 @@ class _EventGuesses(NamedTuple):
 
     used: Bool[Array, "events"]
     node: Int[Array, "events"]  # the node after the event
-    row: Int[Array, "events"]  # of `_event_residuals`
+    row: Int[Array, "events"]  # of the residuals: 0-3 slip of a contact, 4-5 speed of a joint, then the two below
     z: Float[Array, "events 5"]
     chart: Int[Array, "events"]
 
 
-_CHART_CHANGE, _PATH_END = 6, 7  # rows of `_event_residuals`; 0-3: slip of a contact, 4-5: speed of a joint
+_CHART_CHANGE, _PATH_END = 6, 7
 
 
-def locate_events(mechanics: ScaledMechanics, target: PathTarget, curve: TracedCurve, max_events: int) -> EventPoints:
+def locate_events(
+    mechanics: ScaledMechanics, events: EventFunctions, curve: TracedCurve, max_events: int
+) -> EventPoints:
     """Refine the bracketed end and every sign change of slips and joint speeds by Newton's method along the path."""
     guesses = _event_guesses(curve, max_events)
+    terminal = _take_event(events, jnp.maximum(curve.end, 0))
+    side = jnp.where(terminal.residual(curve.end_z, 0.0) < 0, -1.0, 1.0)
 
     def refine(guess: _EventGuesses):
         hint = take_row(curve.nodes.x, jnp.maximum(guess.node - 1, 0))
 
-        def residual(mechanics, z, x, target):
-            return _event_residuals(mechanics, target, curve, z, x, hint @ (z - guess.z))[guess.row]
+        def residual(mechanics, z, x, terminal):
+            beyond_guess = hint @ (z - guess.z)
+            end = jnp.where(curve.end < 0, beyond_guess, terminal.residual(z, side))
+            slips = slip_velocity(mechanics.contacts, z, x)
+            return jnp.concatenate([slips, x[3:], jnp.stack([beyond_guess, end])])[guess.row]
 
         def solve():
-            root = solve_on_path(residual, mechanics, guess.z, hint, target)
+            root = solve_on_path(residual, mechanics, guess.z, hint, terminal)
             return root.z, root.x, root.residual, path_coordinate(curve, guess.chart, root.z)
 
         none = jnp.zeros_like(guess.z[0])
@@ -99,21 +107,10 @@ def _leaves_bracket(curve: TracedCurve, guesses: _EventGuesses, s) -> Bool[Array
     return (s < before - slack) | (s > curve.nodes.s[guesses.node] + slack)
 
 
-def _event_residuals(mechanics, target, curve, z, x, beyond_guess):
-    """Functions that vanish at events: `reversal_functions`, the distance `beyond_guess` along the path, and the
-    terminal event's function (the distance again where the path has no end)."""
-    pairs, rows = mechanics.candidates.lower.shape[0], mechanics.contacts.lower.shape[0]
-    made = jnp.clip(curve.end, 0, pairs - 1)
-    contacts = jax.tree.map(
-        lambda a, b: jnp.append(a, take_row(b, made)[None], axis=0), mechanics.contacts, mechanics.candidates
-    )
-    at = contact_kinematics(contacts, z)
-    feature_distance = [(at.along - contacts.lower)[:rows], (contacts.upper - at.along)[:rows]]
-    target_distance = target.until_value - take_row(z, jnp.maximum(target.until_coordinate, 0))
-    distances = jnp.concatenate([*feature_distance, target_distance[None]])
-    terminal = jnp.where(curve.end < pairs, at.gap[rows], take_row(distances, jnp.maximum(curve.end - pairs, 0)))
-    terminal = jnp.where(curve.end < 0, beyond_guess, terminal)
-    return jnp.concatenate([slip_velocity_at(contacts, at, x)[:rows], x[3:], jnp.stack([beyond_guess, terminal])])
+def _take_event(events: EventFunctions, row) -> EventFunctions:
+    """Take one row of the terminal events."""
+    coordinate = events.coordinate
+    return jax.tree.map(lambda a: take_row(a, row), events._replace(coordinate=coordinate[None] + 0 * row))
 
 
 def _has_bifurcation(mechanics, curve: TracedCurve, end, end_unresolved) -> Bool[Array, ""]:

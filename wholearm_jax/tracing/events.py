@@ -1,23 +1,26 @@
-r"""Watch: what may end a wire, as rows of one table, and which of them a step of the march crosses.
+r"""Terminal events of a path, as rows of one table, and which of them a continuation step crosses.
 
-Gaps of contacts that might be made, room on the features of those that hold, a coordinate's limit: each ends the wire
-where it turns negative, or dips below zero and returns within a step; a vertex behind a finger where its gap turns
-positive. All are the same function of a contact, with weights of their own,
+A path ends where a contact is made, where a contact leaves its feature, where links meet or a joint's range ends, or
+where a coordinate reaches the target's value: where a row's value turns negative, or dips below zero and returns within
+a step; a vertex behind a finger, and a finger on either side of another, also from below. All rows are the same
+function of a contact, with weights of their own,
 
-    value = a gap + b along + c z_k + shift,
+    value = a gap + b along + c z_k + d1 theta1 + d2 theta2 + shift,
 
-so that a step computes them side by side.
+so that a step evaluates them side by side.
 
 Derivation: section 3 of `docs/derivation.md`.
 """
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.model import (
+    Carrier,
     ContactSet,
     PathTarget,
     ScaledMechanics,
@@ -26,9 +29,11 @@ from wholearm_jax.model import (
     gap_velocity,
 )
 
+COINCIDENT_FRACTION = 1e-7  # of a step, within which events count as met at the same place
+
 
 class EventValues(NamedTuple):
-    """Values that stay positive on a wire, their rates `d/ds`, and places along features."""
+    """Values that stay positive on a path, their rates `d/ds`, and places along features."""
 
     values: Float[Array, "rows"]
     rates: Float[Array, "rows"]
@@ -36,70 +41,112 @@ class EventValues(NamedTuple):
 
 
 class EventFunctions(NamedTuple):
-    """What is watched: all pairs that may touch (`ScaledMechanics.candidates`), room before and behind each contact on
-    its
-    feature, and a coordinate's limit.
+    """Weights of the terminal events' values.
 
-    `gap`, `along`, `limit` and `shift` are the weights of a row's value. A pair ends the wire within `[lower, upper]`
-    of its feature, and if it `is_terminal`; `may_start_negative` marks vertices that may lie behind a link.
+    Rows: all pairs that may touch (`ScaledMechanics.candidates`), the distances of the formation's contacts to the
+    begin and the end of their features, the target's coordinate, and the links among themselves (`LinkObstacles`).
     """
 
     contacts: ContactSet
+    # weights
     gap: Float[Array, "rows"]
     along: Float[Array, "rows"]
-    limit: Float[Array, "rows"]
+    coordinate_weight: Float[Array, "rows"]
+    joint_angle: tuple[Float[Array, "rows"], Float[Array, "rows"]]
     shift: Float[Array, "rows"]
-    coordinate: Int[Array, ""]
-    lower: Float[Array, "rows"]
+    coordinate: Int[Array, ""]  # of the target
+    # which crossings end the path
+    lower: Float[Array, "rows"]  # within `[lower, upper]` of the feature
     upper: Float[Array, "rows"]
+    half_width: Float[Array, "rows"]  # size of the value at which a two-sided row is met
     is_terminal: Bool[Array, "rows"]
-    may_start_negative: Bool[Array, "rows"]
+    two_sided: Bool[Array, "rows"]  # the value may start negative: then it is met from below
 
     def at(self, z: Float[Array, "5"], slope: Float[Array, "5"]) -> EventValues:
-        """What is watched at a place of the wire, where `z` changes by `slope` a unit of `s`."""
-        here = contact_kinematics(self.contacts, z)
+        """Evaluate the events at a place of the path, where `z` changes by `slope` a unit of `s`."""
+        here, (first, second) = contact_kinematics(self.contacts, z), self.joint_angle
         return EventValues(
-            values=self.gap * here.gap + self.along * here.along + self.limit * z[self.coordinate] + self.shift,
+            values=self._values(here, z),
             rates=self.gap * gap_velocity(self.contacts, z, slope)
             + self.along * feature_velocity(self.contacts, z, slope)
-            + self.limit * slope[self.coordinate],
+            + self.coordinate_weight * slope[self.coordinate]
+            + first * slope[3]
+            + second * slope[4],
             along=here.along,
+        )
+
+    def residual(self, z: Float[Array, "5"], side: Float[Array, "rows"]) -> Float[Array, "rows"]:
+        """Evaluate what vanishes where an event is met on a `side` (1 or -1)."""
+        return self._values(contact_kinematics(self.contacts, z), z) - side * self.half_width
+
+    def _values(self, here, z):
+        first, second = self.joint_angle
+        return (
+            self.gap * here.gap
+            + self.along * here.along
+            + self.coordinate_weight * z[self.coordinate]
+            + first * z[3]
+            + second * z[4]
+            + self.shift
         )
 
 
 def event_functions(mechanics: ScaledMechanics, target: PathTarget, z: Float[Array, "5"]) -> EventFunctions:
-    """What is watched on a formation's wire from `z` on."""
-    pairs, held, until = mechanics.candidates, mechanics.contacts, target.until_coordinate >= 0
+    """Gather the terminal events of a formation's path from `z` on."""
+    pairs, held, links = mechanics.candidates, mechanics.contacts, mechanics.links
+    until = target.until_coordinate >= 0
     sense = jnp.where(target.until_value < z[target.until_coordinate], -1.0, 1.0)
     one, none, far = jnp.ones_like(held.lower), jnp.zeros_like(held.lower), jnp.full_like(held.lower, jnp.inf)
-    every, nothing = jnp.ones_like(pairs.lower), jnp.zeros_like(pairs.lower)
+    every, nothing, of_links = jnp.ones_like(pairs.lower), jnp.zeros_like(pairs.lower), jnp.zeros_like(links.gap)
 
-    def rows(of_pairs, before, behind, of_limit):
-        return jnp.concatenate([of_pairs, before, behind, jnp.reshape(of_limit, 1)])
+    def rows(of_pairs, before, behind, of_target, of_links):
+        return jnp.concatenate([of_pairs, before, behind, jnp.reshape(of_target, 1), of_links])
 
+    contacts = jax.tree.map(
+        lambda a, b, c: rows(a, b, b, b[0], c),
+        *(_with_carrier(each) for each in (pairs, held, links.contacts)),
+    )
     return EventFunctions(
-        contacts=jax.tree.map(lambda a, b: rows(a, b, b, b[0]), pairs, held),
-        gap=rows(every, none, none, 0.0),
-        along=rows(nothing, one, -one, 0.0),
-        limit=rows(nothing, none, none, jnp.where(until, -sense, 0.0)),
-        shift=rows(nothing, -held.lower, held.upper, jnp.where(until, sense * target.until_value, 1.0)),
+        contacts=contacts,
+        gap=rows(every, none, none, 0.0, links.gap),
+        along=rows(nothing, one, -one, 0.0, of_links),
+        coordinate_weight=rows(nothing, none, none, jnp.where(until, -sense, 0.0), of_links),
+        joint_angle=tuple(rows(nothing, none, none, 0.0, weight) for weight in links.joint_angle),
+        shift=rows(nothing, -held.lower, held.upper, jnp.where(until, sense * target.until_value, 1.0), links.shift),
         coordinate=target.until_coordinate,
-        lower=rows(pairs.lower, -far, -far, -jnp.inf),
-        upper=rows(pairs.upper, far, far, jnp.inf),
-        is_terminal=rows(mechanics.may_terminate, one > 0, one > 0, True),
-        may_start_negative=rows(mechanics.may_be_behind, one < 0, one < 0, False),
+        lower=rows(pairs.lower, -far, -far, -jnp.inf, links.contacts.lower),
+        upper=rows(pairs.upper, far, far, jnp.inf, links.contacts.upper),
+        half_width=rows(nothing, none, none, 0.0, links.half_width),
+        is_terminal=rows(mechanics.may_terminate, one > 0, one > 0, True, links.exists),
+        two_sided=rows(mechanics.may_be_behind, one < 0, one < 0, False, links.two_sided),
     )
 
 
-def detect_events(events: EventFunctions, before: EventValues, after: EventValues, step, tolerance):
-    """Which watched values turn negative within a step (or dip below zero and return), and at what share of it.
+def _with_carrier(contacts: ContactSet) -> ContactSet:
+    """Say of every row that the object carries it, unless it says otherwise."""
+    if contacts.carrier is not None:
+        return contacts
+    none = jnp.zeros_like(contacts.lower)
+    carrier = Carrier(none + 1, (none, none), (none, none))
+    return eqx.tree_at(lambda c: c.carrier, contacts, carrier, is_leaf=lambda leaf: leaf is None)
 
-    The share is a root of the cubic through values and rates: several things that end a wire within the shortest step
+
+def first_event(crossed: Bool[Array, "rows"], fraction: Float[Array, "rows"]) -> Int[Array, ""]:
+    """Choose the event that is met first: of several within rounding of one another, the one that stands first."""
+    where = jnp.where(crossed, fraction, jnp.inf)
+    return jnp.argmax(where <= where.min() + COINCIDENT_FRACTION)
+
+
+def detect_events(events: EventFunctions, before: EventValues, after: EventValues, step, tolerance):
+    """Detect which values turn negative within a step (or dip below zero and return), and at which fraction of it.
+
+    The fraction is a root of the cubic through values and rates: several events within the shortest step
     are told apart to 1e-13.
     """
     # A vertex behind a link, within its length, stops at its back; one misplaced there comes out.
-    sense = jnp.where((before.values < -tolerance) & events.may_start_negative, -1.0, 1.0)
-    old, new, leaving, arriving = sense * before.values, sense * after.values, sense * before.rates, sense * after.rates
+    sense = jnp.where((before.values < -tolerance) & events.two_sided, -1.0, 1.0)
+    old, new = sense * before.values - events.half_width, sense * after.values - events.half_width
+    leaving, arriving = sense * before.rates, sense * after.rates
     # From either side what is within the tolerance counts as in front.
     through = (old >= -tolerance) & (new < -sense * tolerance)
     slope = jnp.where(arriving > leaving, arriving - leaving, 1.0)

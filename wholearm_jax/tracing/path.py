@@ -20,6 +20,7 @@ class PathEnd(enum.IntEnum):
     CONTACT_MADE = 1
     FEATURE_END = 2  # a contact leaves its feature
     TARGET = 3  # the phase's own limit is reached
+    OBSTACLE = 4  # links meet, or a joint's range ends
 
 
 class Resolution(NamedTuple):
@@ -52,7 +53,7 @@ class ContactPath(PathSegments):
     start: Float[Array, "5"]  # configuration
     end: Float[Array, "5"]  # configuration
     end_reason: Int[Array, ""]  # a `PathEnd`
-    end_contact: Int[Array, ""]  # row of `candidates` (made) or of `contacts` (at its feature's end)
+    end_contact: Int[Array, ""]  # row of `candidates` (made), `contacts` (at its feature's end) or `LINK_OBSTACLES`
     slip_sign: Float[Array, "segments rows"]  # Xi
     joint_sign: Float[Array, "segments 2"]
     first: Int[Array, "segments"]  # first panel of each segment

@@ -18,6 +18,7 @@ from wholearm_jax.model import (
     ScaledMechanics,
     constraint_jacobian,
     contact_kinematics,
+    link_overlaps,
 )
 
 
@@ -42,6 +43,11 @@ def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) ->
         & (pairs.gap < -tolerance)
     )
     return jnp.any(beyond) | jnp.any(behind) | link_penetrates_object(mechanics, pairs, tolerance)
+
+
+def links_overlap(mechanics: ScaledMechanics, z: Float[Array, "5"]) -> Bool[Array, ""]:
+    """Whether links lie in one another at `z`, or a joint is beyond its range."""
+    return jnp.any(link_overlaps(mechanics.hand, z[3:]) > eps_power(z, 5 / 8))
 
 
 # Each link's two ends, and the vertices against that link: fingers from root to tip, the palm from left to right.

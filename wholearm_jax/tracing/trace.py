@@ -24,11 +24,12 @@ from wholearm_jax.model import PathTarget, ScaledMechanics, anchor_rolling
 from wholearm_jax.tracing.continuation import trace_curve
 from wholearm_jax.tracing.curve import TracedCurve
 from wholearm_jax.tracing.event_location import locate_events
+from wholearm_jax.tracing.events import event_functions
 from wholearm_jax.tracing.nodes import solve_nodes
 from wholearm_jax.tracing.path import ContactPath, PathEnd, Resolution
 from wholearm_jax.tracing.projection import dominant_coordinate, orient_tangent, project_onto_path
 from wholearm_jax.tracing.segments import distribute_panels, segment_signs, split_into_segments
-from wholearm_jax.tracing.start_checks import is_rank_deficient, violates_contact_limits
+from wholearm_jax.tracing.start_checks import is_rank_deficient, links_overlap, violates_contact_limits
 
 
 def trace_path(
@@ -45,7 +46,8 @@ def trace_path(
     Returns:
         The path. Nothing is raised: `status` is `no_convergence` (the contacts cannot all touch near the start, or an
         event or a node was not located), `left_formation` (at the start a contact is beyond its feature, or the object
-        inside a link), `singular` (dependent constraints, a fold, a bifurcation, or the target's coordinate does not
+        inside a link), `obstacle` (at the start links lie in one another),
+        `singular` (dependent constraints, a fold, a bifurcation, or the target's coordinate does not
         move), `max_steps` (no end within reach) or `ok`.
     """
     # Scale to object units, and anchor rolling contacts where the initial guess has them.
@@ -58,8 +60,10 @@ def trace_path(
     # Project, follow the curve, locate its end and kinks.
     start, residual, tangent = project_onto_path(mechanics, initial_guess)
     tangent = orient_tangent(tangent, fixed_target)
-    curve = trace_curve(fixed, fixed_target, stop_gradient(start), tangent, resolution.max_continuation_steps)
-    points = locate_events(mechanics, target, curve, resolution.segments)
+    events = event_functions(mechanics, target, stop_gradient(start))
+    fixed_start, fixed_events = stop_gradient((start, events))
+    curve = trace_curve(fixed, fixed_events, fixed_start, tangent, resolution.max_continuation_steps)
+    points = locate_events(mechanics, events, curve, resolution.segments)
 
     # Split into segments and solve the constraints at every node.
     segments = split_into_segments(curve, points, start, resolution.segments)
@@ -77,7 +81,8 @@ def trace_path(
     refusals = (
         (~touches & dependent, int(Status.SINGULAR)),
         (~touches, int(Status.NO_CONVERGENCE)),
-        (violates_contact_limits(fixed, stop_gradient(start)), int(Status.LEFT_FORMATION)),
+        (violates_contact_limits(fixed, fixed_start), int(Status.LEFT_FORMATION)),
+        (links_overlap(fixed, fixed_start), int(Status.OBSTACLE)),
         (~moves, int(Status.SINGULAR)),
         (curve.status > 0, curve.status),
         (points.has_bifurcation, int(Status.SINGULAR)),
@@ -99,11 +104,17 @@ def trace_path(
 
 
 def _path_end(curve: TracedCurve, candidates: int) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Translate the row of the terminal event into a `PathEnd` and the row of the contact."""
+    """Translate the row of the terminal event into a `PathEnd` and the row of the contact or obstacle."""
+    contacts_end, target = candidates + 8, candidates + 8  # the contacts' rows stand twice, then comes the target's
     reasons = (
         (curve.end < 0, int(PathEnd.NONE)),
         (curve.end < candidates, int(PathEnd.CONTACT_MADE)),
-        (curve.end < candidates + 8, int(PathEnd.FEATURE_END)),
+        (curve.end < contacts_end, int(PathEnd.FEATURE_END)),
+        (curve.end == target, int(PathEnd.TARGET)),
     )
-    contact = jnp.where(curve.end < candidates, curve.end, (curve.end - candidates) % 4)
-    return jnp.select([c for c, _ in reasons], [end for _, end in reasons], int(PathEnd.TARGET)), contact
+    row = jnp.select(
+        [curve.end < candidates, curve.end < contacts_end],
+        [curve.end, (curve.end - candidates) % 4],
+        jnp.maximum(curve.end - target - 1, 0),
+    )
+    return jnp.select([c for c, _ in reasons], [end for _, end in reasons], int(PathEnd.OBSTACLE)), row

@@ -1,0 +1,147 @@
+"""Obstacles in words: which links meet where a path ends, and what lies in what where a path cannot begin."""
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from wholearm_jax.model import (
+    LINK_OBSTACLES,
+    LINKS,
+    ContactFormation,
+    LinkMeeting,
+    Phase,
+    Scene,
+    contact_candidates,
+    contact_kinematics,
+    contact_set,
+    link_obstacles,
+    link_overlaps,
+    rigid_body,
+)
+
+LEVEL_ANGLE = 1e-9  # [rad], within which a finger is level with the palm
+
+
+def describe_obstacle(scene: Scene, z: Float[Array, "5"], row: int) -> str:
+    """Say which links meet at `z` (SI), or whose range ends there; `row` is one of `LINK_OBSTACLES`."""
+    obstacle = LINK_OBSTACLES[row]
+    finger = LINKS[obstacle.link]
+    if obstacle.meeting in (LinkMeeting.LEAST_ANGLE, LinkMeeting.LARGEST_ANGLE):
+        angle = float(z[2 + obstacle.link])
+        level = abs(np.sin(angle)) < LEVEL_ANGLE and float(scene.hand.joint[obstacle.link - 1, 1]) == 0
+        return f"{finger} reaches its range at {np.degrees(angle):.4g} deg" + (", level with the palm" if level else "")
+    if obstacle.meeting == LinkMeeting.TIP_ON_PALM:
+        return f"{finger} meets the palm at x = {float(_place(scene, z, row)):.4g} m"
+    if obstacle.meeting == LinkMeeting.PALM_END_ON_FINGER:
+        return f"{finger} meets the palm's end at finger{obstacle.palm_end}"
+    other = LINKS[3 - obstacle.link]
+    if obstacle.on_tip_face:
+        return f"{finger} meets {other} at its tip"
+    part = "" if obstacle.corner[0] else "'s joint"
+    return f"{finger}{part} meets {other} {float(_place(scene, z, row)):.3g} m from its joint"
+
+
+def _place(scene: Scene, z, row: int) -> Float[Array, ""]:
+    """Where on its line a row's corner is [m]."""
+    return jax.device_get(_places(scene.hand, z))[row]
+
+
+@jax.jit
+def _places(hand, z):
+    return contact_kinematics(link_obstacles(hand).contacts, z).along
+
+
+def describe_overlaps(scene: Scene, z: Float[Array, "5"], tolerance: float = 1e-9) -> tuple[str, ...]:
+    """Say which links lie in one another or in the object at `z` (SI), at which feature and how deep.
+
+    Args:
+        scene: the hand and the object.
+        z: a configuration (5,).
+        tolerance: a smaller depth is none, in the object's radius (links: radii or radians).
+
+    Returns:
+        A line for each pair, the links among themselves first; empty where nothing overlaps.
+    """
+    radius = float(np.hypot(*np.asarray(rigid_body(scene.object).vertices).T).max())
+    between, palm1, palm2, beyond1, beyond2 = (float(v) for v in _overlaps(scene.hand, z[3:]))
+    lines = []
+    if between > tolerance * radius:
+        lines.append(f"finger1 and finger2 cross, {1e3 * between:.3g} mm deep")
+    for k, depth in enumerate((palm1, palm2)):
+        if depth > tolerance * radius:
+            lines.append(f"finger{k + 1} lies {1e3 * depth:.3g} mm below the palm's surface")
+    for k, angle in enumerate((beyond1, beyond2)):
+        if angle > tolerance:
+            lines.append(f"finger{k + 1} is {np.degrees(angle):.3g} deg beyond its range")
+    return (*lines, *_object_overlaps(scene, z, tolerance * radius))
+
+
+_overlaps = jax.jit(link_overlaps)
+
+
+def describe_refused_start(scene: Scene, phase: Phase, z: Float[Array, "5"]) -> str | None:
+    """Say why no path of a phase can begin at `z` (SI): overlaps, or contacts beyond their features; None: neither."""
+    along, lower, upper = (np.asarray(a) for a in _formation_places(scene, phase.formation, z))
+    beyond = np.maximum(lower - along, along - upper)
+    names = [phase.formation.names[k] for k in phase.formation.contact_of_row]
+    misplaced = dict.fromkeys(
+        f"{names[k]} lies {1e3 * beyond[k]:.3g} mm beyond its feature" for k in np.flatnonzero(beyond > 1e-9)
+    )
+    return "; ".join((*describe_overlaps(scene, z), *misplaced)) or None
+
+
+@jax.jit
+def _formation_places(scene: Scene, formation: ContactFormation, z):
+    contacts = contact_set(rigid_body(scene.object), scene.hand, formation)
+    return contact_kinematics(contacts, z).along, contacts.lower, contacts.upper
+
+
+def _object_overlaps(scene: Scene, z, tolerance: float) -> list[str]:
+    """Say which links lie in the object: behind which of its vertices the link runs, or how deep its tip is."""
+    capacity, count = scene.object.vertices.shape[0], int(scene.object.count)
+    at, lower, upper = jax.device_get(_object_pairs(scene, z))
+    gap, along = (a.reshape(5, capacity)[:, :count] for a in (at.gap, at.along))
+    lower, upper = (a.reshape(5, capacity)[:, :count] for a in (lower, upper))
+    lines = []
+    for link in range(3):  # the first three groups are vertices on the palm and on the fingers
+        line = _link_in_object(link, gap[link], along[link], lower[link, 0], upper[link, 0])
+        if line is not None and line[0] > tolerance:
+            depth, feature = line
+            name = "the palm" if link == 0 else LINKS[link]
+            verb = (
+                f"object lies {1e3 * depth:.3g} mm below the palm"
+                if link == 0
+                else (f"{name} lies {1e3 * depth:.3g} mm inside the object")
+            )
+            lines.append(f"{verb} at {feature}")
+    return lines
+
+
+@jax.jit
+def _object_pairs(scene: Scene, z):
+    pairs: ContactFormation = contact_candidates(scene.object.vertices.shape[0])
+    contacts = contact_set(rigid_body(scene.object), scene.hand, pairs)
+    return contact_kinematics(contacts, z), contacts.lower, contacts.upper
+
+
+def _link_in_object(link: int, gap, along, lower: float, upper: float) -> tuple[float, str] | None:
+    """Return how deep a link lies in a polygon given by its vertices' places in the link's frame, and where."""
+    following = np.roll(np.arange(len(gap)), -1)
+    inside = []  # stretches of the link's line within the polygon
+    crossing = np.flatnonzero((gap > 0) != (gap[following] > 0))
+    other = following[crossing]
+    places = np.sort(along[crossing] + (along[other] - along[crossing]) * gap[crossing] / (gap[crossing] - gap[other]))
+    for begin, end in places.reshape(-1, 2):
+        begin, end = max(begin, lower), min(end, upper)
+        if end > begin:
+            inside.append((begin, end))
+    if not inside:
+        return None
+    within = (along >= min(inside)[0] - 1e-12) & (along <= max(end for _, end in inside) + 1e-12)
+    longest = max(end - begin for begin, end in inside)
+    depths = [(longest, "its tip")] if link > 0 and max(end for _, end in inside) == upper else []
+    for side in (-1.0, 1.0) if link > 0 else (-1.0,):  # vertices behind the link, and before it
+        depth = np.where(within, side * gap, -np.inf)
+        deepest = int(np.argmax(depth))
+        depths += [(float(depth[deepest]), f"vertex {deepest}")] if depth[deepest] > 0 else []
+    return min(depths, default=None)
