@@ -4,7 +4,8 @@ A finger is a strip of the plane: from its joint to its tip, between its contact
 move apart or together first touch where a corner of one meets a face of the other, so that these gaps suffice:
 
 - the corners of each finger against the other finger's long faces, and its tip's corners against the other's tip;
-- the corners of each fingertip against the palm's surface, and the palm's ends against the long faces of each finger.
+- the corners of each fingertip against the palm's surface, and the palm's end at the other finger against each finger's
+  long faces. A finger and the palm's end beside its own joint are mounted on one another and never count as meeting.
 
 Both long faces of a finger are one row: the gap is measured from the strip's middle line, and a corner touches where it
 is half the strip's width, `half_width`, on either side. The ends of the joints' ranges complete the table; they are no
@@ -55,7 +56,7 @@ def _rows() -> tuple[LinkObstacle, ...]:
         *(LinkObstacle(LinkMeeting.FINGER_ON_FINGER, link, corner) for link in fingers for corner in corners),
         *(LinkObstacle(LinkMeeting.FINGER_ON_FINGER, link, (1, side), True) for link in fingers for side in sides),
         *(LinkObstacle(LinkMeeting.TIP_ON_PALM, link, (1, side)) for link in fingers for side in sides),
-        *(LinkObstacle(LinkMeeting.PALM_END_ON_FINGER, link, palm_end=end) for link in fingers for end in fingers),
+        *(LinkObstacle(LinkMeeting.PALM_END_ON_FINGER, link, palm_end=3 - link) for link in fingers),
         *(
             LinkObstacle(kind, link)
             for kind in (LinkMeeting.LEAST_ANGLE, LinkMeeting.LARGEST_ANGLE)
@@ -200,9 +201,10 @@ def _strip(joint, middle, half_width, length, angle, side):
 
 
 def _depth_below_palm(hand: Hand, joint, along, length):
-    """How deep a finger's axis lies below the palm's surface between the palm's ends; the joint itself may."""
+    """Measure how deep a finger whose tip is below the palm's surface reaches below it between the palm's ends."""
     span = jnp.where(along[0] == 0, jnp.finfo(along.dtype).tiny, along[0])
     cuts = (jnp.stack([hand.joint[1, 0], hand.joint[0, 0]]) - joint[0]) / span
     near, far = jnp.clip(cuts.min(), 0.0, length), jnp.clip(cuts.max(), 0.0, length)
     lowest = jnp.minimum(joint[1] + near * along[1], joint[1] + far * along[1])
-    return jnp.where(far - near > CORNER_TOL * length, -lowest, -jnp.inf)
+    is_below = (joint[1] + length * along[1] < 0) & (far - near > CORNER_TOL * length)
+    return jnp.where(is_below, -lowest, -jnp.inf)
