@@ -55,8 +55,8 @@ def test_a_schedule_may_be_built_within_a_transformation():
 
 def test_defects_of_a_schedule_built_by_hand():
     schedule = TorqueSchedule(jnp.arange(4.0), jnp.asarray(with_value(1, 1, np.nan)))
-    assert "row 1 has tau2 = nan" in find_schedule_defect(schedule)
-    assert find_schedule_defect(TorqueSchedule(jnp.arange(4.0), jnp.asarray(ZEROS))) is None
+    assert "row 1 has tau2 = nan" in find_schedule_defect(schedule.times, schedule.values)
+    assert find_schedule_defect(jnp.arange(4.0), jnp.asarray(ZEROS)) is None
 
 
 def test_limits_that_are_exceeded():

@@ -58,27 +58,27 @@ def torque_schedule(times, values) -> TorqueSchedule:
     Traceback (most recent call last):
     ValueError: times must not decrease, and none may stand more than twice: row 1 has t = 0 after 1
     """
-    schedule = TorqueSchedule(as_concrete_array(times, float), as_concrete_array(values, float))
-    defect = find_schedule_defect(schedule)
+    times, values = as_concrete_array(times, float), as_concrete_array(values, float)
+    defect = find_schedule_defect(times, values)
     if defect is not None:
         raise ValueError(defect)
-    return schedule
+    return TorqueSchedule(times, values)
 
 
-def find_schedule_defect(schedule: TorqueSchedule) -> str | None:
-    """Say why a schedule cannot be followed, naming the first row (from 0) that is wrong; None where it can be."""
-    shape = schedule.times.shape
-    if len(shape) != 1 or shape[0] < 2 or schedule.values.shape != (*shape, 2):
+def find_schedule_defect(times, values) -> str | None:
+    """Say why the rows of a schedule cannot be followed, naming the first that is wrong (from 0), or return None."""
+    shape = times.shape
+    if len(shape) != 1 or shape[0] < 2 or values.shape != (*shape, 2):
         return "a torque schedule needs at least two rows of t, tau1, tau2"
-    if not is_traced(schedule.values):
-        values = np.asarray(schedule.values)
+    if not is_traced(values):
+        values = np.asarray(values)
         rows, joints = np.nonzero(~np.isfinite(values))
         if rows.size:
             row, joint = int(rows[0]), int(joints[0])
             return f"a torque schedule must be finite: row {row} has tau{joint + 1} = {values[row, joint]:g}"
-    if is_traced(schedule.times):
+    if is_traced(times):
         return None
-    times = np.asarray(schedule.times)
+    times = np.asarray(times)
     if not np.all(np.isfinite(times)):
         row = int(np.argmin(np.isfinite(times)))
         return f"a torque schedule must be finite: row {row} has t = {times[row]:g}"

@@ -26,7 +26,7 @@ def require_covered(scenes: Scene, torque: TorqueSchedule) -> None:
 
 def require_followable(torque: TorqueSchedule) -> None:
     """Raise ValueError for a schedule that is not finite or not sorted, naming the row."""
-    defect = find_schedule_defect(torque)
+    defect = find_schedule_defect(torque.times, torque.values)
     if defect is not None:
         raise ValueError(defect)
 
