@@ -144,13 +144,18 @@ def main() -> None:
     """Measure, save, draw, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=3)
-    repeats = parser.parse_args().repeats
+    parser.add_argument("--quick", action="store_true", help="`simulate` alone, once; saves nothing")
+    given = parser.parse_args()
+    if given.quick:
+        torque = Path(__file__).parent / "data" / "heptagon_knots.csv"
+        tabulate("simulate", measured("simulate", COMMANDS["simulate"], 1, torque))
+        return
     with tempfile.TemporaryDirectory() as folder:
         run(COMMANDS["optimise"], Path(folder, "cache"), Path(folder, "out"))
         torque = Path(folder, "out", "torque.csv")
         found = {}
         for name, command in COMMANDS.items():
-            found[name] = measured(name, command, repeats, torque)
+            found[name] = measured(name, command, given.repeats, torque)
             tabulate(name, found[name])
     path = measure.save("cold_start", found)
     draw(found, path.with_suffix(".svg"))

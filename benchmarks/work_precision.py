@@ -18,7 +18,6 @@ fastest runs that are at least as good.
 """
 
 import argparse
-import importlib.util
 import itertools
 import json
 import os
@@ -29,7 +28,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import diffrax as dfx
@@ -111,12 +109,11 @@ def problems(*, referred: bool) -> list[Problem]:
     """The four; without their references (minutes of work) where only times are wanted."""
     scene = wa.load("heptagon")
     traced = wa.trace(scene)
-    unreduced = _by_path("unreduced", HERE.parent / "tests" / "unreduced.py")
     kinds = ("knots", "ramps")
-    return [_problem(scene, traced, p, kind, unreduced, referred) for p, kind in itertools.product((0, 1), kinds)]
+    return [_problem(scene, traced, p, kind, referred) for p, kind in itertools.product((0, 1), kinds)]
 
 
-def _problem(scene, traced, phase, kind, unreduced, referred) -> Problem:
+def _problem(scene, traced, phase, kind, referred) -> Problem:
     given = wa.read_torque(HERE / "data" / f"heptagon_{kind}.csv")
     start, duration = jnp.asarray(float(phase)), jnp.asarray(float(scene.phases[phase].duration))
     schedule = pad_schedule(given)
@@ -133,8 +130,11 @@ def _problem(scene, traced, phase, kind, unreduced, referred) -> Problem:
     if not referred:
         return Problem(*at)
 
+    sys.path.insert(0, str(HERE.parent))  # the un-reduced simulation is one of the tests' oracles
+    from tests.reference.unreduced import Model
+
     data = scene_file.to_dict(scene)
-    model = unreduced.Model(data, data["phase"][phase]["contacts"])
+    model = Model(data, data["phase"][phase]["contacts"])
     z = np.asarray(traced[phase].path.start * system_of(scene, phase).configuration_unit)
     follow = partial(_follow, model, z, data["phase"][phase]["toward"], given, float(start))
     reference = follow(min(end + 1e-6, 1.0) if kind != "knots" else stop + 1e-6, 1e-13)
@@ -414,16 +414,6 @@ def tabulate(dynamics: dict, against: str) -> None:
         print(f"\n{problem}: time over that of '{against}'" + "".join(f"{e:8.0e}" for e in LEVELS))
         for name, values in rows.items():
             print(f"  {name:40s}" + "".join("       -" if v is None else f"{v:8.3g}" for v in values))
-
-
-def _by_path(name: str, path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def _in_process(*arguments: str, flags: str = "") -> dict:

@@ -5,30 +5,65 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
 ROOT = Path(__file__).parents[2]
-RUNS = {
-    "random_plans": "run('--count', '1', '--phases', '1')",
-    "flying_plans": "run('--count', '1', '--phases', '2')",
+RUNS = {  # what each runs, after `import NAME as module`
+    "batch": "module.COUNTS = (8, 8); run('--quick')",
+    "cold_start": "run('--quick')",
+    "collocation": "run('heptagon', '--knots', '8')",
     "execution": "module.SCENES, module.STEPS = ('heptagon',), (1.6e-3, 8e-4); run('--quick')",
+    "flying_plans": "run('--count', '1', '--phases', '2')",
+    "gradients": "module.KNOTS, module.TOLERANCES = (4,), (1e-4,); run('--quick')",
+    "optimisation": "module.random_plans = lambda *_: (); run('--quick', '--knots', '8')",
+    "prediction": "module.SORTS, module.TIMESTEP = {'stopping': 1}, 4e-4; run('--quick', '--seeds', '0')",
+    "random_plans": "run('--count', '1', '--phases', '1')",
+    "skipping": "module.problems = lambda **_: PROBLEMS(referred=False)[:1]; run('--quick')",
+    "work_precision": "print(module.in_turn(PROBLEMS(referred=False)[0], 'Dopri8', 1e-7, 1))",
 }
+NEEDS = {"collocation": "casadi", "optimisation": "casadi", "skipping": "numba", "work_precision": "numba"}
 PRELUDE = """
 import sys, {name} as module
+PROBLEMS = getattr(module, "problems", None)
 def run(*arguments):
-    sys.argv = ["{name}.py", *arguments, "--out", {out!r}] if {takes_out} else ["{name}.py", *arguments]
+    sys.argv = ["{name}.py", *arguments]
     module.main()
 """
+SWEEP = """
+from pathlib import Path
+from benchmarks.stability import sweep
+sweep.BLOCK, sweep.DIFFERENTIATED = 4, 2
+level = sweep.DOUBLE.levels[0]._replace(lanes=4)
+sweep.DOUBLE = sweep.DOUBLE._replace(levels=(level,))
+sweep.work([0], 1, single=False, target=Path("records.npz"))
+"""
+
+
+def test_every_script_is_run():
+    scripts = {path.stem for path in (ROOT / "benchmarks").glob("*.py") if "def main(" in path.read_text()}
+    assert scripts == set(RUNS)
+    folders = {path.parent.name for path in (ROOT / "benchmarks").glob("*/__main__.py")}
+    assert folders == {"stability"}
 
 
 @pytest.mark.parametrize("name", RUNS)
 def test_benchmark_runs_on_its_smallest_part(name, tmp_path):
-    source = (ROOT / "benchmarks" / f"{name}.py").read_text()
-    program = PRELUDE.format(name=name, out=str(tmp_path), takes_out='"--out"' in source) + RUNS[name]
+    pytest.importorskip(NEEDS.get(name, "numpy"))
+    assert run_apart(PRELUDE.format(name=name) + RUNS[name], tmp_path)
+
+
+def test_the_stability_sweep_runs_on_a_few_scenes(tmp_path):
+    assert "block 0:" in run_apart(SWEEP, tmp_path)
+    assert (tmp_path / "records.npz").exists()
+
+
+def run_apart(program, folder):
+    """Run a program in a process of its own, with the programs that are kept; return what it prints."""
     paths = [str(ROOT / "benchmarks"), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "MPLBACKEND": "agg"}
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
-    )
+    kept = {"JAX_COMPILATION_CACHE_DIR": str(jax.config.values["jax_compilation_cache_dir"])}
+    environment = os.environ | kept | {"PYTHONPATH": os.pathsep.join(paths), "MPLBACKEND": "agg"}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.strip() or any(tmp_path.iterdir())
+    return done.stdout.strip()
