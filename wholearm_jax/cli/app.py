@@ -6,6 +6,7 @@ Exit status 0 when the result is `ok`, 1 when the plan fails (its status is prin
 import gc
 import os
 import sys
+import warnings
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +14,7 @@ from typing import Annotated, Any
 import jax
 import typer
 
-from wholearm_jax.cli.arguments import BadInput
+from wholearm_jax.cli.arguments import BadInput, note
 from wholearm_jax.cli.check import check
 from wholearm_jax.cli.execute import execute
 from wholearm_jax.cli.formations import formations
@@ -22,7 +23,7 @@ from wholearm_jax.cli.report import report
 from wholearm_jax.cli.scenes import scenes
 from wholearm_jax.cli.search import search
 from wholearm_jax.cli.simulate import simulate
-from wholearm_jax.core import configure, enable_program_cache
+from wholearm_jax.core import DoubtfulInput, configure, enable_program_cache
 
 UsageError: Any = typer.BadParameter.__mro__[1]  # of the library beneath, which Typer has under changing names
 
@@ -58,6 +59,7 @@ def main() -> None:
     if sys.argv[1:2] != ["check"]:  # `check` configures itself by the number of its scenes
         configure()
     _keep_compiled()
+    _print_doubts_as_notes()
     try:
         sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False) or 0)
     except typer.Abort:
@@ -68,6 +70,19 @@ def main() -> None:
     except BadInput as error:
         print(f"wholearm: {error}", file=sys.stderr)
         sys.exit(2)
+
+
+def _print_doubts_as_notes() -> None:
+    """Print warnings about doubtful input as the notes of the command line."""
+    show = warnings.showwarning
+
+    def show_note(message, category, *others):
+        if issubclass(category, DoubtfulInput):
+            note(str(message))
+        else:
+            show(message, category, *others)
+
+    warnings.showwarning = show_note
 
 
 def _keep_compiled() -> None:

@@ -12,10 +12,14 @@ from typing import Annotated
 
 import typer
 
-from wholearm_jax.core import BadInput
+from wholearm_jax.core import BadInput, as_device_array
 
 ARRIVAL_FRACTION = 0.01  # of a path's length: perturbed plans cannot end where an unperturbed one must
 TORQUE_HELP = "Torque schedule, CSV with the header t,tau1,tau2."
+SET_HELP = (
+    "PHASE.duration=SECONDS, PHASE.until.COORDINATE=VALUE or start.COORDINATE=VALUE; PHASE is a name or a number from "
+    '0, an angle a number of radians or "-40 deg". May be repeated.'
+)
 
 SceneName = Annotated[str, typer.Argument(help="A bundled scene's name, or the path of a scene file.")]
 TorqueFile = Annotated[Path, typer.Option("--torque", help=TORQUE_HELP)]
@@ -24,7 +28,7 @@ OutputFolder = Annotated[
 ]
 Changes = Annotated[
     list[str] | None,
-    typer.Option("--set", help="PHASE.duration=SECONDS; PHASE is a name or a number from 0. May be repeated."),
+    typer.Option("--set", help=SET_HELP),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 Samples = Annotated[int, typer.Option(min=2, help="Rows a phase in trajectory.csv.")]
@@ -36,30 +40,63 @@ def load_scene(name: str, changes: list[str] | None = None):
 
     scene = load(name)
     for change in changes or ():
-        scene = _change_duration(scene, change)
+        scene = _change_scene(scene, change)
     return scene
 
 
-def _change_duration(scene, change: str):
-    """Apply `PHASE.duration=SECONDS`."""
+def _change_scene(scene, change: str):
+    """Apply `PHASE.duration=SECONDS`, `PHASE.until.COORDINATE=VALUE` or `start.COORDINATE=VALUE`."""
     import equinox as eqx
+    import numpy as np
 
-    from wholearm_jax.model import replace_duration
+    from wholearm_jax.model import COORDINATES, path_target, replace_duration
 
     key, _, value = change.partition("=")
-    phase, _, field = key.rpartition(".")
-    names = [p.name for p in scene.phases]
-    row = phase_number(scene, phase)
-    if field != "duration" or row is None:
-        raise BadInput(f"--set {change}: write PHASE.duration=SECONDS; phases: {', '.join(names)}")
+    owner, _, field = key.rpartition(".")
+    if owner == "start" and field in COORDINATES:
+        start = np.array(scene.start)
+        start[COORDINATES.index(field)] = _read_coordinate(change, field, value)
+        return eqx.tree_at(lambda s: s.start, scene, as_device_array(start))
+    until = owner.endswith(".until") and field in COORDINATES
+    row = phase_number(scene, owner.removesuffix(".until") if until else owner)
+    if row is None or not (until or field == "duration"):
+        names = ", ".join(p.name for p in scene.phases)
+        others = "PHASE.until.COORDINATE=VALUE or start.COORDINATE=VALUE"
+        raise BadInput(f"--set {change}: write PHASE.duration=SECONDS, {others}; phases: {names}")
+    if until:
+        limit = path_target(None, {field: _read_coordinate(change, field, value)})
+        limits = limit.until_coordinate, limit.until_value
+        return eqx.tree_at(lambda s: _until_of(s.phases[row]), scene, limits)
     try:
         seconds = float(value)
     except ValueError:
         seconds = float("nan")
     if not 0 < seconds < float("inf"):
         raise BadInput(f"--set {change}: a duration is a positive number of seconds")
-    phases = tuple(replace_duration(p, seconds) if k == row else p for k, p in enumerate(scene.phases))
-    return eqx.tree_at(lambda s: s.phases, scene, phases)
+    return eqx.tree_at(lambda s: s.phases[row], scene, replace_duration(scene.phases[row], seconds))
+
+
+def _until_of(phase):
+    return phase.target.until_coordinate, phase.target.until_value
+
+
+def _read_coordinate(change: str, coordinate: str, text: str) -> float:
+    """Read a coordinate's value: metres, radians or an angle with its unit."""
+    from wholearm_jax.files.angles import ANGLE_COORDINATES, ANGLE_HINT, is_beyond_a_turn, read_angle
+
+    is_angle = coordinate in ANGLE_COORDINATES
+    try:
+        number = float(text)
+        if is_angle and is_beyond_a_turn(number):
+            note(f'--set {change}: {number:g} radians are more than a whole turn; degrees are written "{number:g} deg"')
+    except ValueError:
+        try:
+            number = read_angle(text) if is_angle else float("nan")
+        except ValueError:
+            number = float("nan")
+    if not abs(number) < float("inf"):
+        raise BadInput(f"--set {change}: {coordinate} is {ANGLE_HINT if is_angle else 'a number of metres'}")
+    return number
 
 
 def phase_number(scene, phase: str) -> int | None:

@@ -14,7 +14,7 @@ from wholearm_jax.core.arrays import (
 from wholearm_jax.core.atomic_files import write_atomically, write_together
 from wholearm_jax.core.background_compile import BackgroundTask, compile_in_background, wait_for
 from wholearm_jax.core.config import configure
-from wholearm_jax.core.errors import BadInput, SceneError, StoreError
+from wholearm_jax.core.errors import BadInput, DoubtfulInput, SceneError, StoreError
 from wholearm_jax.core.linear_programme import LinearProgramme, LinearProgrammeSolution
 from wholearm_jax.core.program_cache import CachedJit, enable_program_cache
 from wholearm_jax.core.small_linalg import fused_matmul, inverse_and_determinant, null_vector, solve

@@ -1,4 +1,4 @@
-"""Errors about what a user gave. Each message is one line that names the file or argument and what is wrong."""
+"""Errors and notes about what a user gave. Each is one line that names the file or argument and what is wrong."""
 
 
 class BadInput(Exception):
@@ -11,3 +11,7 @@ class SceneError(BadInput, ValueError):
 
 class StoreError(BadInput):
     """A store of checks that cannot be used."""
+
+
+class DoubtfulInput(UserWarning):
+    """Input that can be used, but may not be what was meant; the command line prints it as a note."""

@@ -4,6 +4,7 @@ import difflib
 import math
 import re
 import tomllib
+import warnings
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,6 +15,7 @@ import tomli_w
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Discriminator,
     Field,
@@ -23,7 +25,8 @@ from pydantic import (
     model_validator,
 )
 
-from wholearm_jax.core import SceneError, as_device_array, write_atomically
+from wholearm_jax.core import DoubtfulInput, SceneError, as_device_array, write_atomically
+from wholearm_jax.files.angles import Angle, doubtful_angles, read_angles_by_coordinate
 from wholearm_jax.model import (
     COORDINATES,
     LINKS,
@@ -70,7 +73,7 @@ class _Finger(_Strict):
     length: Positive
     offset: Finite = 0.0
     back: NonNegative = 0.0
-    range: Annotated[Pair, AfterValidator(_increasing)] = (0.0, math.pi)
+    range: Annotated[tuple[Angle, Angle], AfterValidator(_increasing)] = (0.0, math.pi)
     inertia: Positive
     viscous: NonNegative = 0.0
     dry: NonNegative = 0.0
@@ -116,9 +119,9 @@ class _Object(_Strict):
 class _Start(_Strict):
     x: Finite
     y: Finite
-    phi: Finite
-    theta1: Finite
-    theta2: Finite
+    phi: Angle
+    theta1: Angle
+    theta2: Angle
 
 
 def _four_constraints(contacts: list[str]) -> list[str]:
@@ -145,12 +148,17 @@ def _one_coordinate(until: dict[str, float]) -> dict[str, float]:
     return until
 
 
+_Until = Annotated[
+    dict[Coordinate, Finite], BeforeValidator(read_angles_by_coordinate), AfterValidator(_one_coordinate)
+]
+
+
 class _Phase(_Strict):
     name: str
     contacts: Annotated[list[str], AfterValidator(_four_constraints)]
     toward: Annotated[str, AfterValidator(_signed_coordinate)] | None = None
     duration: Positive
-    until: Annotated[dict[Coordinate, Finite], AfterValidator(_one_coordinate)] | None = None
+    until: _Until | None = None
     arrive: Literal["rest", "moving", "caught"] | None = None
     hold: StrictBool = False
 
@@ -242,7 +250,15 @@ def _read_toml(name: str | Path) -> dict[str, Any]:
 
 
 def parse(data: dict[str, Any], source: str = "scene") -> Scene:
-    """A scene from nested dictionaries, as TOML gives them. Raises `SceneError`; `source` begins its message.
+    """Build a scene from nested dictionaries, as TOML gives them; angles are radians or texts such as `"-40 deg"`.
+
+    Args:
+        data: The tables of a scene file.
+        source: Name of the scene, with which messages begin.
+
+    Raises:
+        SceneError: With one line that names the key and what is wrong. A number that may be meant as degrees gives a
+            `DoubtfulInput` warning.
 
     >>> from wholearm_jax.files.scene_toml import to_dict
     >>> data = to_dict(wa.load("heptagon"))
@@ -258,6 +274,8 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
         checked = _Scene.model_validate(data)
     except ValidationError as error:
         raise SceneError(f"{source}: {explain_validation_error(error)}") from None
+    for doubt in doubtful_angles(data):
+        warnings.warn(f"{source}: {doubt}", DoubtfulInput, stacklevel=2)
     fingers = (checked.hand.finger1, checked.hand.finger2)
     shape, friction = checked.object, checked.object.friction
     each = friction if isinstance(friction, float) else [getattr(friction, link) for link in LINKS]
