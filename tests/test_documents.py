@@ -113,6 +113,19 @@ def test_names_of_the_glossary_exist():
     assert named <= defined_names() | set(wa.__all__)
 
 
+def test_every_class_that_a_folder_offers_is_in_the_glossary():
+    named = set(re.findall(r"`([\w.]+)`", (DOCS / "glossary.md").read_text()))
+    named |= {name.partition(".")[0] for name in named}
+    offered = {
+        name
+        for folder in FOLDERS
+        for name, value in vars(importlib.import_module(f"wholearm_jax.{folder}")).items()
+        if isinstance(value, type) and value.__module__.startswith("wholearm_jax.")
+    }
+    assert len(offered) >= 30
+    assert sorted(offered - named) == []
+
+
 def test_new_names_of_the_changes_exist():
     rows = re.findall(r"^\|[^|]*\|([^|]*)\|$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     named = {name for row in rows for name in re.findall(r"`([\w.]+)", row)}
