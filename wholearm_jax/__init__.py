@@ -9,6 +9,7 @@ after the other), `optimisation`, `planning`, `ensembles` (many scenes), `execut
 import warnings
 from typing import TYPE_CHECKING
 
+import wholearm_jax.cli.interruption  # noqa: F401, first: a command may be interrupted while the rest is imported
 from wholearm_jax.core import Status, configure
 from wholearm_jax.ensembles import check
 from wholearm_jax.files import load, parse, read_torque, save, write_torque

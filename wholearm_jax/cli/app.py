@@ -18,6 +18,7 @@ from wholearm_jax.cli.arguments import BadInput, note
 from wholearm_jax.cli.check import check
 from wholearm_jax.cli.execute import execute
 from wholearm_jax.cli.formations import formations
+from wholearm_jax.cli.interruption import INTERRUPTED, exit_on_interrupt
 from wholearm_jax.cli.optimise import optimise
 from wholearm_jax.cli.report import report
 from wholearm_jax.cli.scenes import scenes
@@ -51,6 +52,7 @@ for command in (check, scenes, optimise, simulate, formations, search, report, e
 
 def main() -> None:
     """Run the command line."""
+    restore_interrupt = exit_on_interrupt()
     # BLAS threads cost more than they gain on small systems: they wait for one another, spinning.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("MPLBACKEND", "agg")
@@ -63,13 +65,15 @@ def main() -> None:
     try:
         sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False) or 0)
     except typer.Abort:
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
     except UsageError as error:
         print(f"wholearm: {error.format_message()}", file=sys.stderr)
         sys.exit(2)
     except BadInput as error:
         print(f"wholearm: {error}", file=sys.stderr)
         sys.exit(2)
+    finally:
+        restore_interrupt()
 
 
 def _print_doubts_as_notes() -> None:

@@ -234,6 +234,6 @@ def _summarise(store, scene, source, out: Path):
     files = FileSet(f"{out.stem}.json", (), (out.stem,))
     with refuse_unwritable(str(out)), replace_files(out.parent, files) as scratch:
         content = null_for_undefined(summary.as_dict() | more)
-        write_atomically(scratch / files.record, json.dumps(content, indent=1, allow_nan=False) + "\n")
+        write_atomically(scratch / f"{out.stem}.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
         save_figure(lambda: plot_ensemble(summary, more.get("influence"), mapped), scratch, out.stem)
     return summary.lines, content

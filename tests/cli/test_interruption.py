@@ -1,0 +1,100 @@
+"""Ctrl-C at any moment: one line, exit status 130, soon, and what was compiled and written before stays."""
+
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from wholearm_jax.cli.interruption import _is_being_written, exit_on_interrupt
+
+SOON = 1.0  # s, of a machine that does nothing else
+MOMENTS = [0.5, *(random.Random(7).uniform(1.0, 9.0) for _ in range(3))]
+
+
+def interrupted(command, moment, cache):
+    """Exit status, standard error and seconds of a command that gets SIGINT after `moment` seconds."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XDG_"))}
+    environment |= {"XDG_CACHE_HOME": str(cache)}
+    program = [sys.executable, "-m", "wholearm_jax", *command]
+    with subprocess.Popen(
+        program, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        time.sleep(moment)
+        process.send_signal(signal.SIGINT)
+        begun = time.perf_counter()
+        _, err = process.communicate(timeout=60)
+        return process.returncode, err, time.perf_counter() - begun
+
+
+def busy() -> float:
+    """How many times as long as alone a process takes on this machine now, about."""
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_ctrl_c_while_it_imports_traces_and_compiles(moment, tmp_path):
+    code, err, seconds = interrupted(
+        ["optimise", "heptagon", "--out", str(tmp_path / "out")], moment, tmp_path / "cache"
+    )
+    assert code == 130, err
+    assert err.splitlines()[-1] == "wholearm: interrupted"
+    assert not re.search("Traceback|Fatal|Error|abort", err)
+    assert seconds < SOON * busy()
+    assert not list(Path(tmp_path).glob("out/*"))
+    assert not [path for path in Path(tmp_path).rglob(".*") if path.is_file()], "nothing is left half written"
+
+
+def test_a_process_of_ones_own_keeps_its_handler():
+    """`main` called from Python, as by these tests, hands SIGINT back."""
+    before = signal.getsignal(signal.SIGINT)
+    restore = exit_on_interrupt()
+    assert signal.getsignal(signal.SIGINT) is not before
+    restore()
+    assert signal.getsignal(signal.SIGINT) is before
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    time.sleep(0.1)  # the thread that waits for signals has seen it, and has not ended the process
+
+
+def test_ctrl_c_waits_for_files_that_are_being_written(tmp_path):
+    """A set of files that is being moved into place: the process ends once it is whole."""
+    script = """
+import os, sys, time
+from pathlib import Path
+from wholearm_jax.cli.interruption import exit_on_interrupt
+from wholearm_jax.core import atomic_files
+exit_on_interrupt()
+replace = os.replace
+def slow(*names):
+    print("moving", flush=True)
+    time.sleep(0.1)
+    replace(*names)
+os.replace = slow
+atomic_files.write_together(Path(sys.argv[1]), {"a": "new", "b": "new", "summary.json": "new"}, "summary.json")
+time.sleep(60)
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "moving\n"
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "wholearm: interrupted\n")
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(
+        ("a", "b", "summary.json"), "new"
+    )
+
+
+def test_a_program_that_is_being_written_is_noticed(tmp_path):
+    assert not _is_being_written(tmp_path / "none")
+    (tmp_path / "program").write_bytes(b"1")
+    assert _is_being_written(tmp_path)
+    os.utime(tmp_path / "program", (0, 0))
+    assert not _is_being_written(tmp_path)
