@@ -34,6 +34,7 @@ from jax.sharding import Mesh, PartitionSpec
 import wholearm_jax as wa
 from wholearm_jax.ensembles import BLOCK, COARSE_PASS, check_scene, make_ensemble
 from wholearm_jax.model import TorqueSchedule, pad_schedule
+from wholearm_jax.simulation import Adjoint
 
 HERE = Path(__file__).parent
 COUNTS = (128, 1024, 8192, 65_536, 1_000_000)
@@ -128,7 +129,7 @@ def gradients(ensemble, torque) -> dict:
     """Checks with the gradient with respect to all torques, a block at a time."""
     schedule, options = pad_schedule(torque), COARSE_PASS.options
     level = COARSE_PASS._replace(
-        options=replace(options, adjoint="reverse", has_jumps=bool(np.any(np.diff(torque.times) == 0)))
+        options=replace(options, adjoint=Adjoint.REVERSE, has_jumps=bool(np.any(np.diff(torque.times) == 0)))
     )
 
     def one(number):

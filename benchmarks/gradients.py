@@ -6,7 +6,7 @@ The margin of one phase (move, then score) and its derivatives with respect to t
 
     forward   `jax.jacfwd` through the solve, all directions at once
     reverse   `jax.value_and_grad` back over the steps that the solve took, each computed once more
-    direct    `jax.value_and_grad` through a solve that keeps every step (`adjoint="both"`)
+    direct    `jax.value_and_grad` through a solve that keeps every step (`adjoint=Adjoint.BOTH`)
 
 Times are those of value and gradient together, as multiples of the margin alone, warm and in turn; compile times are
 fresh ones. The schedule is a straight line however many knots describe it, so that the motion is always the same.

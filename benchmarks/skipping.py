@@ -23,14 +23,14 @@ from wholearm_jax.dynamics import evaluate, locate_panel
 from wholearm_jax.margin import contact_force, minimum_margin
 from wholearm_jax.model import interval, rigid_body, torque_at
 from wholearm_jax.phases import DEFAULT_SAMPLES, sample_phase, trace_phase
-from wholearm_jax.simulation import TerminalEvent, integrate_adaptive, path_acceleration, simulate_motion
+from wholearm_jax.simulation import Adjoint, TerminalEvent, integrate_adaptive, path_acceleration, simulate_motion
 from wholearm_jax.tracing import Resolution
 
 COARSE = Resolution(6, 16, 8)
 
 
 @partial(jax.jit, static_argnames="adjoint")
-def moved(dynamics, phase_schedule, duration, adjoint="none"):
+def moved(dynamics, phase_schedule, duration, adjoint=Adjoint.NONE):
     """The motion alone."""
     return simulate_motion(dynamics, phase_schedule, duration, options=wa.IntegratorOptions(adjoint=adjoint))
 
@@ -151,7 +151,7 @@ def rows(problem, repeats: int) -> list[dict]:
 
 
 def _margin(dynamics, phase_schedule, duration, values):
-    options = wa.IntegratorOptions(adjoint="both")
+    options = wa.IntegratorOptions(adjoint=Adjoint.BOTH)
     slope = (
         jnp.diff(values, axis=0)
         / jnp.where(jnp.diff(phase_schedule.phase_time) > 0, jnp.diff(phase_schedule.phase_time), 1.0)[:, None]

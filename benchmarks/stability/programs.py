@@ -15,13 +15,7 @@ from jaxtyping import Array, Float
 
 from benchmarks.stability.scenes import Scenes
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel, resolve_impact, tabulate_path_dynamics
-from wholearm_jax.margin import (
-    best_quasistatic_torque_batch,
-    contact_force,
-    dense_output,
-    evaluate_dense,
-    minimum_margin,
-)
+from wholearm_jax.margin import best_quasistatic_torque_batch, contact_force, minimum_margin
 from wholearm_jax.model import (
     Arrival,
     ContactFormation,
@@ -36,7 +30,7 @@ from wholearm_jax.model import (
     torque_at,
 )
 from wholearm_jax.phases import assess_phase
-from wholearm_jax.simulation import IntegratorOptions, path_acceleration, simulate_motion
+from wholearm_jax.simulation import IntegratorOptions, dense_output, evaluate_dense, path_acceleration, simulate_motion
 from wholearm_jax.tracing import ContactPath, Resolution, trace_path
 
 PLACES = np.concatenate([[0.0], (np.arange(30) + 0.5) / 30 + 0.01 * np.sin(np.arange(30.0)), [1.0]])

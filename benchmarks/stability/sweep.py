@@ -13,7 +13,7 @@ from benchmarks.stability.programs import FLOATS, GAUSS, follower, forward, reve
 from benchmarks.stability.scenes import BLOCK, Scenes, draw
 from tests.reference.mechanics import Model, dot
 from wholearm_jax.core import configure
-from wholearm_jax.simulation import IntegratorOptions
+from wholearm_jax.simulation import Adjoint, IntegratorOptions
 from wholearm_jax.tracing import Resolution
 
 STATUSES = (
@@ -356,7 +356,7 @@ def check_gradients(found, scenes, stepped, precision):
     good = (found["status"] == checks.OK) & found["moved"] & (found["level"] == 0) & (scenes.stepped == stepped)
     rows = np.flatnonzero(good)
     how = IntegratorOptions(
-        max_steps=level.steps, max_stages=8, tolerance=level.tolerance, has_jumps=stepped, adjoint="both"
+        max_steps=level.steps, max_stages=8, tolerance=level.tolerance, has_jumps=stepped, adjoint=Adjoint.BOTH
     )
     for batch, real in batches(len(rows), DIFFERENTIATED):
         some = to_device(Scenes(*scenes[rows[batch]]))

@@ -11,7 +11,7 @@ from wholearm_jax.model.scene import replace_duration
 from wholearm_jax.phases.compressive_margin import plan_margin
 from wholearm_jax.phases.plan_schedule import has_torque_jumps, with_plan_step_capacity
 from wholearm_jax.phases.plan_simulation import simulate_phases
-from wholearm_jax.simulation.integrator import IntegratorOptions, with_step_capacity
+from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
 
 @pytest.fixture(scope="module")

@@ -10,15 +10,14 @@ import wholearm_jax as wa
 from wholearm_jax.execution.executions import ExecutionOutcome, execute
 from wholearm_jax.files.results import summary
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.margin.quasistatic import best_quasistatic_torque
-from wholearm_jax.margin.statics import contact_statics, rest_margin
+from wholearm_jax.margin import best_quasistatic_torque, contact_statics, rest_margin
 from wholearm_jax.model.scene import Arrival, replace_duration
 from wholearm_jax.model.schedule import pad_schedule
 from wholearm_jax.optimisation.plan_transitions import holding_schedule
 from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.phases.phase_ends import statics_at_start
 from wholearm_jax.phases.phase_simulation import simulate_phase
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation import IntegratorOptions
 
 HALF, MASS, MU, DRY, LIMIT = 0.03, 0.2, 0.3, 0.01, 1.0
 WEIGHT, HEIGHT = MASS * 9.81, 2 * HALF

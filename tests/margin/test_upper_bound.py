@@ -10,8 +10,8 @@ import pytest
 from scipy.optimize import linprog
 
 import wholearm_jax as wa
+from wholearm_jax.margin import BOUND_PLACES, BOUND_SPEEDS, MAX_SPEED_RATIO
 from wholearm_jax.margin import quasistatic as squeeze
-from wholearm_jax.margin.quasistatic import BOUND_PLACES, BOUND_SPEEDS, MAX_SPEED_RATIO
 from wholearm_jax.model import Arrival
 
 coefficients, bound, hold = (

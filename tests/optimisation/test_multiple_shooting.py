@@ -8,13 +8,11 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.margin import quasistatic as squeeze
-from wholearm_jax.margin.contact_forces import dense_output, evaluate_dense
 from wholearm_jax.model.schedule import restrict_to_phase
 from wholearm_jax.optimisation.multiple_shooting import simulate_intervals
 from wholearm_jax.optimisation.variables import Variables, interval_inputs
 from wholearm_jax.phases.plan_tracing import trace
-from wholearm_jax.simulation.integrator import IntegratorOptions
-from wholearm_jax.simulation.phase_motion import simulate_motion
+from wholearm_jax.simulation import IntegratorOptions, dense_output, evaluate_dense, simulate_motion
 
 OPTIONS = IntegratorOptions()
 

@@ -13,7 +13,7 @@ from wholearm_jax.optimisation.linearisation import linearise
 from wholearm_jax.optimisation.riccati import MIN_REGULARISATION, kkt_step, project_step
 from wholearm_jax.optimisation.variables import Variables
 from wholearm_jax.phases.plan_tracing import trace
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation import IntegratorOptions
 
 KNOTS = 7
 

@@ -7,10 +7,10 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.dynamics import Impact
-from wholearm_jax.margin.contact_forces import MarginResult
+from wholearm_jax.margin import MarginResult
 from wholearm_jax.model import Arrival
 from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, DEFAULT_ARRIVAL, IMPULSE_ROUNDING, assess_phase
-from wholearm_jax.simulation.phase_motion import Motion
+from wholearm_jax.simulation import Motion
 
 S = wa.Status
 CALM = Impact(speed=jnp.asarray(0.0), impulse=jnp.zeros(4), size=jnp.asarray(1.0))

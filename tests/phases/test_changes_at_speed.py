@@ -15,7 +15,7 @@ from wholearm_jax.model.scene import path_target as wa_heading
 from wholearm_jax.optimisation.optimiser import MIN_TRANSITION_SPEED
 from wholearm_jax.phases import has_torque_jumps, simulate_phases
 from wholearm_jax.phases.phase_ends import start_configuration
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation import Adjoint, IntegratorOptions
 
 FLIGHTS = ("flight", "passage")
 
@@ -94,7 +94,7 @@ def test_derivatives_pass_through_the_changes(flown):
             tolerance=1e-13, max_steps=512, has_jumps=has_torque_jumps(scene, torque), adjoint=adjoint
         )
 
-    def end(amount, adjoint="none"):
+    def end(amount, adjoint=Adjoint.NONE):
         schedule = wa.TorqueSchedule(torque.times, base + amount * way)
         found = simulate_phases(scene, schedule, traced, options(adjoint))
         second = found[1]

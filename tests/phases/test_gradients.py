@@ -14,6 +14,7 @@ from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.phases.compressive_margin import plan_margin
 from wholearm_jax.phases.gradients import MAX_FORWARD_DIRECTIONS, choose_mode, torque_gradient
 from wholearm_jax.phases.plan_simulation import simulate_phases
+from wholearm_jax.simulation import Adjoint
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -50,7 +51,7 @@ def test_who_arrives_early_in_a_batch_keeps_its_gradient():
     """What a batch computes for members that have finished must not turn their derivatives into NaN."""
     data = to_dict(wa.load("heptagon"))
     scene = wa.parse(data | {"phase": [data["phase"][0] | {"arrive": "caught", "duration": 4.0}]})
-    traced, options = wa.trace(scene), wa.IntegratorOptions(adjoint="both")
+    traced, options = wa.trace(scene), wa.IntegratorOptions(adjoint=Adjoint.BOTH)
     times = jnp.linspace(0.0, 4.0, 5)
     pushes = jnp.asarray([[0.6, -0.2], [1.0, 0.5], [0.55, -0.22]])
 

@@ -17,7 +17,7 @@ from wholearm_jax.model import Arrival
 from wholearm_jax.phases.phase_ends import configuration, start_configuration
 from wholearm_jax.phases.phase_simulation import simulate_phase
 from wholearm_jax.phases.sampling import sample_phase
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation import IntegratorOptions
 
 
 @jax.jit

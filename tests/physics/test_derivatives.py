@@ -9,12 +9,11 @@ from support import assert_modes_and_differences_agree, ending_at_its_kink
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.margin.contact_forces import minimum_margin
+from wholearm_jax.margin import minimum_margin
 from wholearm_jax.model.schedule import TorqueSchedule, restrict_to_phase
 from wholearm_jax.phases.compressive_margin import margin
 from wholearm_jax.phases.gradients import torque_gradient
-from wholearm_jax.simulation.integrator import IntegratorOptions
-from wholearm_jax.simulation.phase_motion import simulate_motion
+from wholearm_jax.simulation import Adjoint, IntegratorOptions, simulate_motion
 
 
 def one_phase(name, row, push, change=lambda data: None, duration=0.6):
@@ -78,7 +77,7 @@ def test_a_margin_where_a_wire_ends_beside_a_kink_has_its_derivative(beyond):
     reverses: there is no piece in which forces, and the place of the least, would vary by rounding alone."""
     scene, _ = ending_at_its_kink(beyond)
     torques = wa.torque_schedule([0.0, 1.0], [[1.5, -0.9], [-1.2, 0.0]])
-    options = IntegratorOptions(adjoint="forward", tolerance=1e-10)
+    options = IntegratorOptions(adjoint=Adjoint.FORWARD, tolerance=1e-10)
     (traced,) = wa.trace(scene)
 
     @jax.jit

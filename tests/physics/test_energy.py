@@ -10,7 +10,7 @@ from wholearm_jax.model.kinematics import contact_set, tangential_jacobian
 from wholearm_jax.model.scene import Arrival, rigid_body
 from wholearm_jax.phases.phase_simulation import simulate_phase
 from wholearm_jax.phases.sampling import sample_phase
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation import IntegratorOptions
 
 NODES = 8  # Gauss-Legendre points a step
 

@@ -13,8 +13,13 @@ from support import steadiest_difference
 
 import wholearm_jax as wa
 from wholearm_jax.dynamics import equations_of_motion, evaluate, locate_panel, placeholder_dynamics
-from wholearm_jax.margin.contact_forces import MAX_REFINED, SAMPLES_PER_STEP, minimum_margin, quintic_hermite
-from wholearm_jax.margin.quasistatic import best_quasistatic_torque, best_quasistatic_torque_batch
+from wholearm_jax.margin import (
+    MAX_REFINED,
+    SAMPLES_PER_STEP,
+    best_quasistatic_torque,
+    best_quasistatic_torque_batch,
+    minimum_margin,
+)
 from wholearm_jax.model.kinematics import contact_kinematics, gaps
 from wholearm_jax.model.mechanics import scaled_mechanics
 from wholearm_jax.model.scene import rigid_body
@@ -23,8 +28,7 @@ from wholearm_jax.phases.phase_ends import describe_end
 from wholearm_jax.phases.phase_tracing import trace_phase
 from wholearm_jax.phases.plan_simulation import simulate_phases
 from wholearm_jax.phases.sampling import sample_phase
-from wholearm_jax.simulation.integrator import IntegratorOptions
-from wholearm_jax.simulation.phase_motion import simulate_motion
+from wholearm_jax.simulation import IntegratorOptions, quintic_hermite, simulate_motion
 from wholearm_jax.tracing.events import EventValues, detect_events
 from wholearm_jax.tracing.path import Resolution
 from wholearm_jax.tracing.start_checks import link_penetrates_object

@@ -25,7 +25,7 @@ from wholearm_jax.model.scene import Arrival, contact_formation, rigid_body
 from wholearm_jax.model.schedule import TorqueSchedule
 from wholearm_jax.phases.phase_simulation import simulate_phase
 from wholearm_jax.phases.sampling import sample_phase
-from wholearm_jax.simulation.integrator import IntegratorOptions
+from wholearm_jax.simulation import IntegratorOptions
 
 DURATION = 1.0
 

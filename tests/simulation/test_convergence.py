@@ -15,8 +15,7 @@ from wholearm_jax.core.status import Status
 from wholearm_jax.dynamics import placeholder_dynamics
 from wholearm_jax.ensembles.ensemble import make_ensemble
 from wholearm_jax.model.schedule import pad_schedule, restrict_to_phase
-from wholearm_jax.simulation.integrator import IntegratorOptions
-from wholearm_jax.simulation.phase_motion import simulate_motion
+from wholearm_jax.simulation import IntegratorOptions, simulate_motion
 from wholearm_jax.tracing.path import Resolution
 
 LOOSE = 1e6  # a tolerance that accepts every step: steps are what lies between knots

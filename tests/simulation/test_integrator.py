@@ -8,7 +8,8 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.model.schedule import restrict_to_phase
-from wholearm_jax.simulation.integrator import (
+from wholearm_jax.simulation import (
+    Adjoint,
     IntegratorOptions,
     TerminalEvent,
     integrate_adaptive,
@@ -132,7 +133,7 @@ def spring_of(stiffness, phase_schedule):
 def test_steps_are_gone_back_over():
     """From their end to a state, a parameter and the time of their beginning; modes that it would get wrong raise."""
     steps, phase_schedule, _, y = steps_of([0.0, 0.4, 1.0], tolerance=1e-12)
-    options = IntegratorOptions(tolerance=1e-12, adjoint="reverse")
+    options = IntegratorOptions(tolerance=1e-12, adjoint=Adjoint.REVERSE)
 
     def end(y, stiffness=9.0, begin=0.0):
         inputs = jnp.asarray(stiffness), phase_schedule, jnp.asarray(begin), y

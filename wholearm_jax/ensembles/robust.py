@@ -25,9 +25,9 @@ from wholearm_jax.ensembles.sampled_margins import SampledMargins, SampledScenes
 from wholearm_jax.model import TorqueSchedule, limit_violations
 from wholearm_jax.optimisation import optimise
 from wholearm_jax.phases import has_torque_jumps, require_covered, require_motion, simulate, with_plan_step_capacity
-from wholearm_jax.simulation import IntegratorOptions
+from wholearm_jax.simulation import Adjoint, IntegratorOptions
 
-SAMPLE_OPTIONS = IntegratorOptions(tolerance=1e-7, max_steps=128, max_stages=6, adjoint="reverse")
+SAMPLE_OPTIONS = IntegratorOptions(tolerance=1e-7, max_steps=128, max_stages=6, adjoint=Adjoint.REVERSE)
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,22 @@
 """Contact forces, their exact minimum over time, quasi-static torques, upper bounds, statics of rest."""
 
 from wholearm_jax.margin.contact_forces import (
+    MAX_REFINED,
     MAX_ROLLING,
-    DenseOutput,
+    SAMPLES_PER_STEP,
     MarginResult,
     cone_facets,
     contact_force,
-    dense_output,
-    evaluate_dense,
     force_slack,
     is_duplicate_facet,
     log_barrier_minimum,
     minimum_margin,
-    quintic_hermite,
     sampled_slacks,
 )
 from wholearm_jax.margin.quasistatic import (
+    BOUND_PLACES,
+    BOUND_SPEEDS,
+    MAX_SPEED_RATIO,
     MarginBound,
     acceleration_terms,
     affine_coefficients,

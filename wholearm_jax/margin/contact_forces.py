@@ -24,13 +24,19 @@ from jaxtyping import Array, Bool, Float, Int
 from wholearm_jax.core import take_row
 from wholearm_jax.dynamics import (
     PathDynamics,
-    differentiate_polynomial,
     evaluate_dot,
-    evaluate_polynomial,
     locate_panel,
 )
 from wholearm_jax.model import PhaseSchedule, torque_at
-from wholearm_jax.simulation import IntegratorOptions, Motion, path_acceleration, solver_step
+from wholearm_jax.simulation import (
+    DenseOutput,
+    IntegratorOptions,
+    Motion,
+    dense_output,
+    evaluate_dense,
+    path_acceleration,
+    solver_step,
+)
 
 SAMPLES_PER_STEP = 7  # places in a step at which forces are sampled before the minimum is refined
 MAX_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
@@ -52,66 +58,6 @@ class MarginResult(NamedTuple):
     contact: Int[Array, ""]
     loss_time: Float[Array, ""]
     loss_contact: Int[Array, ""]
-
-
-class DenseOutput(eqx.Module):
-    """The steps of a motion as quintics: everything that forces within step `i` depend on."""
-
-    phase_time: Float[Array, "steps 2"]
-    quintic: Float[Array, "steps 6"]
-    segment: Int[Array, "steps"]
-    row: Int[Array, "steps"]
-    at_rest: Bool[Array, "steps"]
-    live: Bool[Array, "steps"]
-
-
-def dense_output(
-    dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration: Float[Array, ""], motion: Motion
-) -> DenseOutput:
-    """The steps of a motion as arcs."""
-    # A step that takes no time has no speed of its own: its neighbours hold what is before it and behind.
-    live = (jnp.arange(motion.at_rest.shape[0]) < motion.count) & (motion.phase_time[1:] > motion.phase_time[:-1])
-    phase_time, s = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (motion.phase_time, motion.s))
-    w = jnp.stack([motion.w_begin, motion.w[1:]], axis=1)
-    each = jax.vmap(quintic_hermite, (None, None, None, 0, 0, 0, 0, 0, 0))
-    quintic = each(
-        dynamics, phase_schedule, duration, phase_time, s, w, motion.segment, motion.row, live & ~motion.at_rest
-    )
-    return DenseOutput(phase_time, quintic, motion.segment, motion.row, motion.at_rest, live)
-
-
-def quintic_hermite(
-    dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, phase_time, s, w, segment, row, moving
-) -> Float[Array, "6"]:
-    """The quintic Hermite arc in `xi` in [0, 1] between a step's two ends; `s` stays where nothing moves."""
-    width = phase_time[1] - phase_time[0]
-    bend = jax.vmap(path_acceleration, (None, None, None, None, None, 0, 0, 0))(
-        dynamics, phase_schedule, duration, segment, row, phase_time, s, w
-    )
-    d0, d1 = jnp.where(moving, w * width, 0.0)
-    b0, b1 = jnp.where(moving, bend * width**2, 0.0)
-    rise = s[1] - s[0]
-    # A step as short as the rounding of `s`, as across a tiny piece, would take its speed from that rounding.
-    even = (d0 + d1) / 2 + (b0 - b1) / 12
-    rise = jnp.where(jnp.abs(rise - even) < 8 * jnp.finfo(rise.dtype).eps * jnp.abs(s[1]), even, rise)
-    quintic = [
-        s[0],
-        d0,
-        b0 / 2,
-        10 * rise - 6 * d0 - 4 * d1 - 1.5 * b0 + b1 / 2,
-        -15 * rise + 8 * d0 + 7 * d1 + 1.5 * b0 - b1,
-        6 * rise - 3 * (d0 + d1) - (b0 - b1) / 2,
-    ]
-    return jnp.stack(quintic)
-
-
-def evaluate_dense(one: DenseOutput, xi: Float[Array, ""]):
-    """Share, `s` and `w` at `xi` of one arc (no leading axis)."""
-    width = one.phase_time[1] - one.phase_time[0]
-    s = evaluate_polynomial(one.quintic, xi)
-    slope = evaluate_polynomial(differentiate_polynomial(one.quintic), xi)
-    moving = one.live & ~one.at_rest
-    return one.phase_time[0] + xi * width, s, jnp.where(moving, slope / jnp.where(moving, width, 1.0), 0.0)
 
 
 def contact_force(

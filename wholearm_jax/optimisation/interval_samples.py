@@ -11,8 +11,9 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from wholearm_jax.dynamics import differentiate_polynomial
-from wholearm_jax.margin import MAX_ROLLING, DenseOutput, cone_facets, quintic_hermite, sampled_slacks
-from wholearm_jax.optimisation.interval_steps import IntervalODE, States, Times
+from wholearm_jax.margin import MAX_ROLLING, cone_facets, sampled_slacks
+from wholearm_jax.optimisation.interval_steps import States, Times
+from wholearm_jax.simulation import DenseOutput, PathODE, quintic_hermite
 
 SINGLE_STEP_INTERVALS = 50  # intervals of a phase from which one solver step in each serves; fewer take two
 SLACKS_PER_SAMPLE = 4 + MAX_ROLLING
@@ -40,7 +41,7 @@ def samples_per_part(intervals: int) -> int:
     return SAMPLE_SPACINGS + steps_per_interval(intervals)
 
 
-def sample_part(ode: IntervalODE, intervals: int, times: Times, states: States, segment) -> PartSamples:
+def sample_part(ode: PathODE, intervals: int, times: Times, states: States, segment) -> PartSamples:
     """Sample the forces and bound the speeds of a part of an interval, given the ends of its steps."""
     count, samples = steps_per_interval(intervals), samples_per_part(intervals)
     steps = _dense_output(ode, times, states, segment)
@@ -52,7 +53,7 @@ def sample_part(ode: IntervalODE, intervals: int, times: Times, states: States, 
     return PartSamples(force, force_weight, speed, speed_weight)
 
 
-def _dense_output(ode: IntervalODE, times: Times, states: States, segment) -> DenseOutput:
+def _dense_output(ode: PathODE, times: Times, states: States, segment) -> DenseOutput:
     """Interpolate the steps of a part."""
     phase_time, s, w = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (times, states[:, 0], states[:, 1]))
     count = phase_time.shape[0]

@@ -13,23 +13,16 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
+from wholearm_jax.core import find_bracketed_root
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.model import PhaseSchedule
-from wholearm_jax.simulation import IntegratorOptions, path_acceleration, solver_step
+from wholearm_jax.simulation import IntegratorOptions, PathODE, solver_step, state_rate
 
 MAX_KINK_ITERATIONS = 30  # most Newton steps to the kink
 KINK_TOL = 1e-8  # size of the last Newton step, over the interval; the rest is corrected to first order
 
 Times = Float[Array, "ends"]  # interval times at which steps end, the first one's start included
 States = Float[Array, "ends 2"]  # (s, w) at these times
-
-
-class IntervalODE(NamedTuple):
-    """The equation of motion of one interval: path dynamics, linear torques, duration [s]."""
-
-    dynamics: PathDynamics
-    phase_schedule: PhaseSchedule
-    duration: Float[Array, ""]
 
 
 class PartState(NamedTuple):
@@ -41,11 +34,11 @@ class PartState(NamedTuple):
     has_part: Bool[Array, "*intervals"]  # whether a part of the interval has been simulated
 
 
-def interval_ode(dynamics: PathDynamics, intervals: int, q: Float[Array, "7"]) -> IntervalODE:
+def interval_ode(dynamics: PathDynamics, intervals: int, q: Float[Array, "7"]) -> PathODE:
     """Build the equation of motion of an interval from its inputs `q`, for a phase of `intervals`."""
     values, zero = q[2:6].reshape(2, 2) * dynamics.torque_limit, jnp.zeros((), int)
     phase_schedule = PhaseSchedule(jnp.arange(2.0), values, values[1:] - values[:-1], zero, zero)
-    return IntervalODE(dynamics, phase_schedule, jnp.exp(q[6]) / intervals)
+    return PathODE(dynamics, phase_schedule, jnp.exp(q[6]) / intervals)
 
 
 def begin_interval(dynamics: PathDynamics, intervals: int, q: Float[Array, "7"]) -> PartState:
@@ -57,7 +50,7 @@ def begin_interval(dynamics: PathDynamics, intervals: int, q: Float[Array, "7"])
 
 
 def integrate_to_end(
-    ode: IntervalODE, options: IntegratorOptions, start: PartState, count: int
+    ode: PathODE, options: IntegratorOptions, start: PartState, count: int
 ) -> tuple[PartState, Times, States]:
     """Integrate a whole interval in the segment where it begins, in `count` steps.
 
@@ -71,7 +64,7 @@ def integrate_to_end(
 
 
 def integrate_to_kink(
-    ode: IntervalODE, options: IntegratorOptions, start: PartState, count: int
+    ode: PathODE, options: IntegratorOptions, start: PartState, count: int
 ) -> tuple[PartState, Times, States]:
     """Integrate from `start` to the interval's end or the segment's, whichever comes first, in `count` steps.
 
@@ -85,9 +78,7 @@ def integrate_to_kink(
     times, states = _integrate_steps(ode, options, start, jnp.where(ends_at_kink, length, remaining), count)
 
     def rate(phase_time, y):
-        row = jnp.zeros((), int)
-        acceleration = path_acceleration(*ode, start.segment, row, phase_time, y[0], y[1])
-        return jnp.stack([y[1], acceleration])
+        return state_rate(ode, start.segment, jnp.zeros((), int), phase_time, y)
 
     # One more Newton step, of rounding size: it carries the derivatives of the kink's time.
     speed = jnp.where(ends_at_kink, stop_gradient(states[-1, 1]), 1.0)
@@ -114,37 +105,29 @@ def _segment_end(dynamics: PathDynamics, segment) -> Float[Array, ""]:
 
 
 def _length_to_kink(
-    ode: IntervalODE, start: PartState, s_kink, options: IntegratorOptions, count: int
+    ode: PathODE, start: PartState, s_kink, options: IntegratorOptions, count: int
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     """Find the time from `start` after which `count` steps end at `s_kink`; all that remains if they fall short.
 
-    Newton's method on the steps' total length, bisecting where it would leave the bracket. Also returns whether it
-    converged.
+    Also returns whether the iteration converged.
     """
     remaining = 1 - start.phase_time
 
-    def narrow(bracket):
-        low, high, length, _, iteration = bracket
+    def overshoot(length):
         _, states = _integrate_steps(ode, options, start, length, count)
-        miss = states[-1, 0] - s_kink
-        low, high = jnp.where(miss < 0, length, low), jnp.where(miss < 0, high, length)
-        newton = length - miss / jnp.where(states[-1, 1] == 0, 1.0, states[-1, 1])
-        newton = jnp.where((newton >= low) & (newton <= high), newton, (low + high) / 2)
-        falls_short = (iteration == 0) & ~(miss > 0)
-        converged = falls_short | (jnp.abs(newton - length) <= KINK_TOL * remaining)
-        return low, high, jnp.where(falls_short, remaining, newton), converged, iteration + 1
+        return states[-1, 0] - s_kink, states[-1, 1]
 
-    def unfinished(bracket):
-        *_, converged, iteration = bracket
-        return ~converged & (iteration < MAX_KINK_ITERATIONS)
-
-    begin = (0 * remaining, remaining, remaining, ~(remaining > 0), 0)
-    _, _, length, converged, _ = jax.lax.while_loop(unfinished, narrow, begin)
-    return length, converged
+    return find_bracketed_root(
+        overshoot,
+        remaining,
+        tolerance=KINK_TOL * remaining,
+        max_iterations=MAX_KINK_ITERATIONS,
+        may_lie_beyond=True,
+    )
 
 
 def _integrate_steps(
-    ode: IntervalODE, options: IntegratorOptions, start: PartState, length, count: int
+    ode: PathODE, options: IntegratorOptions, start: PartState, length, count: int
 ) -> tuple[Times, States]:
     """Take `count` equal solver steps of the given total length."""
     row = jnp.zeros((), int)

@@ -10,7 +10,7 @@ from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.plan_schedule import has_torque_jumps, require_followable, with_plan_step_capacity
 from wholearm_jax.phases.plan_simulation import simulate_phases
 from wholearm_jax.phases.plan_tracing import trace
-from wholearm_jax.simulation import IntegratorOptions
+from wholearm_jax.simulation import Adjoint, IntegratorOptions
 from wholearm_jax.tracing import Resolution
 
 MIN_FLOAT32_TOLERANCE = 1e-5  # of the integrator: float32 cannot meet less
@@ -20,7 +20,7 @@ def margin(
     scene: Scene,
     torque: TorqueSchedule,
     *,
-    options: IntegratorOptions = IntegratorOptions(adjoint="both"),
+    options: IntegratorOptions = IntegratorOptions(adjoint=Adjoint.BOTH),
     resolution: Resolution = Resolution(),
 ) -> Float[Array, ""]:
     """Compute the compressive margin of a plan, formations assumed to hold.

@@ -27,7 +27,7 @@ from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.phases.plan_schedule import has_torque_jumps, with_plan_step_capacity
 from wholearm_jax.phases.plan_simulation import simulate_phases
 from wholearm_jax.phases.plan_tracing import trace
-from wholearm_jax.simulation import IntegratorOptions, tolerance_as_data
+from wholearm_jax.simulation import Adjoint, IntegratorOptions, tolerance_as_data
 
 MAX_FORWARD_DIRECTIONS = 2  # rows of a schedule up to which forward mode costs less
 CHECKED_TOLERANCES = (1e-8, 1e-10, 1e-12)
@@ -67,9 +67,9 @@ def torque_gradient(
     return _margin_and_gradient(scene, torque, traced or trace(scene), options)
 
 
-def choose_mode(torque: TorqueSchedule) -> str:
-    """Return the mode that costs less for a schedule: `"forward"` or `"reverse"`."""
-    return "forward" if torque.times.shape[0] <= MAX_FORWARD_DIRECTIONS else "reverse"
+def choose_mode(torque: TorqueSchedule) -> Adjoint:
+    """Return the mode that costs less for a schedule: forward or reverse."""
+    return Adjoint.FORWARD if torque.times.shape[0] <= MAX_FORWARD_DIRECTIONS else Adjoint.REVERSE
 
 
 @eqx.filter_jit
@@ -80,7 +80,7 @@ def _margin_and_gradient(scene, torque, traced, options):
         m = plan_margin(scene, simulate_phases(scene, TorqueSchedule(torque.times, values), traced, options))
         return m, m
 
-    derivative = jax.jacfwd if options.adjoint == "forward" else jax.grad
+    derivative = jax.jacfwd if options.adjoint is Adjoint.FORWARD else jax.grad
     gradient, m = derivative(value, has_aux=True)(torque.values)
     return m, gradient
 
@@ -138,18 +138,20 @@ def check_gradient(
         options = IntegratorOptions(tolerance=jnp.asarray(tolerance), adjoint=adjoint)
         return margin(*eqx.combine(inputs, rest), options=options)
 
-    if not np.isfinite(float(value(floats, 1e-8, "none"))):
+    if not np.isfinite(float(value(floats, 1e-8, Adjoint.NONE))):
         raise ValueError("the plan has no margin to differentiate: simulate it to see why")
     derivatives = []
     for tolerance in tolerances:
-        gradient = jax.grad(lambda inputs, tol=tolerance: value(inputs, tol, "both"))(floats)
+        gradient = jax.grad(lambda inputs, tol=tolerance: value(inputs, tol, Adjoint.BOTH))(floats)
         for name, tangent in _directions(floats, seed).items():
-            forward = jax.jvp(lambda inputs, tol=tolerance: value(inputs, tol, "forward"), (floats,), (tangent,))[1]
+            _, forward = jax.jvp(
+                lambda inputs, tol=tolerance: value(inputs, tol, Adjoint.FORWARD), (floats,), (tangent,)
+            )
             pairs = zip(*map(jax.tree.leaves, (gradient, tangent)), strict=True)
             reverse = sum(float((g * d).sum()) for g, d in pairs)
 
             def along(h, tangent=tangent, tol=tolerance):
-                return float(value(optax.tree.add_scale(floats, h, tangent), tol, "none"))
+                return float(value(optax.tree.add_scale(floats, h, tangent), tol, Adjoint.NONE))
 
             uncertainty, slope = _most_stable([_richardson(along, step) for step in DIFFERENCE_STEPS])
             derivatives.append(DirectionalDerivative(name, tolerance, float(forward), reverse, slope, uncertainty))

@@ -9,10 +9,10 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.core import CachedJit, Status, require_positive
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
-from wholearm_jax.margin import contact_force, dense_output, evaluate_dense
+from wholearm_jax.margin import contact_force
 from wholearm_jax.model import Arrival, TorqueSchedule, interval, pad_schedule, restrict_to_phase, round_up, torque_at
 from wholearm_jax.phases.result import Result
-from wholearm_jax.simulation import Motion
+from wholearm_jax.simulation import Motion, dense_output, evaluate_dense
 
 DEFAULT_SAMPLES = 1024  # samples of a phase that one call computes: numbers of samples that differ share a program
 

@@ -1,11 +1,9 @@
 """The motion of one phase: adaptive steps that end on events."""
 
-from wholearm_jax.simulation.event_step import path_acceleration, solver_step
-from wholearm_jax.simulation.integrator import (
-    IntegratorOptions,
-    TerminalEvent,
-    integrate_adaptive,
-    tolerance_as_data,
-    with_step_capacity,
-)
-from wholearm_jax.simulation.phase_motion import Motion, simulate_motion
+from wholearm_jax.simulation.integrator import TerminalEvent, integrate_adaptive
+from wholearm_jax.simulation.integrator_options import Adjoint, IntegratorOptions, tolerance_as_data, with_step_capacity
+from wholearm_jax.simulation.interpolation import DenseOutput, dense_output, evaluate_dense, quintic_hermite
+from wholearm_jax.simulation.motion_record import Motion
+from wholearm_jax.simulation.path_ode import PathODE, path_acceleration, solver_step, state_rate
+from wholearm_jax.simulation.phase_motion import simulate_motion
+from wholearm_jax.simulation.replay import integrate_with_replay_adjoint, replay_steps

@@ -1,107 +1,88 @@
-"""Landings: the last step of a stage, taken again with the length that ends exactly where the stage does.
+"""The last step of a smooth stage, taken again with the length that ends exactly on the stage's terminal event.
 
 Derivation: section 6 of `docs/derivation.md`.
 """
 
-import diffrax as dfx
-import jax
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float
 
-from wholearm_jax.core import eps_power
-from wholearm_jax.dynamics import PathDynamics, evaluate_dot, locate_panel
-from wholearm_jax.model import PhaseSchedule, torque_at
-from wholearm_jax.simulation.integrator import IntegratorOptions, solver_of
+from wholearm_jax.core import eps_power, find_bracketed_root
+from wholearm_jax.simulation.integrator_options import IntegratorOptions
+from wholearm_jax.simulation.path_ode import PathODE, solver_step, state_rate
 
-MAX_EVENT_ITERATIONS = 40  # at most so many Newton steps, or halvings, to the place where a stage ends
-
-
-@jax.jit
-def path_acceleration(dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, segment, row, phase_time, s, w):
-    """`dw/du` for forward travel in a piece and a torque interval."""
-    panel, xi = locate_panel(dynamics, segment, s)
-    rest = jnp.stack([duration**2, w**2, duration * w])
-    terms = jnp.concatenate([rest, duration**2 * torque_at(phase_schedule, row, phase_time)])
-    return evaluate_dot(dynamics.acceleration, panel, xi, terms)
+MAX_EVENT_ITERATIONS = 40
 
 
-@jax.jit
-def solver_step(dynamics, phase_schedule, duration, options: IntegratorOptions, segment, row, phase_time, y, length):
-    """One step of the solver from `y = (s, w)` at a share of the phase, within a piece and a torque interval."""
-    solver = solver_of(options)
+class EventStep(NamedTuple):
+    """The end of a step on an event."""
 
-    def field(u, y, args):
-        dynamics, phase_schedule, duration = args
-        return jnp.stack([y[1], path_acceleration(dynamics, phase_schedule, duration, segment, row, u, y[0], y[1])])
-
-    term, args = dfx.ODETerm(field), (dynamics, phase_schedule, duration)
-    state = solver.init(term, phase_time, phase_time + length, y, args)
-    return solver.step(term, phase_time, phase_time + length, y, args, state, made_jump=True)[0]
+    phase_time: Float[Array, ""]
+    s: Float[Array, ""]
+    w: Float[Array, ""]
+    at_stop: Bool[Array, ""]  # on `s_stop`; else at rest
+    failed: Bool[Array, ""]  # no length within the step ends on an event
 
 
-def step_to_event(dynamics, phase_schedule, duration, options, segment, row, node, end, s_stop, w_stop, wanted):
-    """Retake the last step from `node` with the length that lands on `s = goal` or on `w = 0`, whichever comes first.
+def step_to_event(
+    ode: PathODE, options: IntegratorOptions, segment, row, start, end, s_stop, w_stop, is_needed: Bool[Array, ""]
+) -> EventStep:
+    """Take a step from `start` that ends at `s = s_stop` or at rest, whichever comes first.
 
-    Returns where it lands, whether on the goal, and whether it went astray: no length within the step lands there.
+    The length is found without derivatives. A first-order correction of rounding size then carries them: exact in first
+    derivatives, as the event's time depends on the step by the implicit function theorem.
+
+    Args:
+        ode: Equation of motion.
+        options: Options of the integrator.
+        segment: Segment of the path.
+        row: Interval of the schedule.
+        start: Phase time, `s` and `w` where the step begins.
+        end: Phase time before which the event lies.
+        s_stop: Where the segment ends (infinite: nowhere).
+        w_stop: Speed at which the object rests: 0 (minus infinity: never).
+        is_needed: Whether there is an event; else the step has no length.
     """
-    phase_time, s, w = node
-    longest = jnp.where(wanted, end - phase_time, 0.0)
-
-    def field(phase_time, y, args):
-        dynamics, phase_schedule, duration = args
-        return jnp.stack(
-            [y[1], path_acceleration(dynamics, phase_schedule, duration, segment, row, phase_time, y[0], y[1])]
-        )
-
-    def step(phase_time, length, y, args):
-        dynamics, phase_schedule, duration = args
-        return solver_step(dynamics, phase_schedule, duration, options, segment, row, phase_time, y, length)
-
-    args = (dynamics, phase_schedule, duration)
-    fixed = stop_gradient((phase_time, jnp.stack([s, w]), args, longest))
-    goal_now = stop_gradient(s_stop)
-
-    def beyond(y):
-        """Whether the goal is passed by more than the speed has fallen below rest, and by how much."""
-        passing, resting = y[0] - goal_now, w_stop - y[1]
-        return passing >= resting, jnp.maximum(passing, resting)
-
-    def narrow(bracket):
-        """Newton on the step's length, bisecting where it would leave the bracket."""
-        low, high, length, _, count = bracket
-        y = step(fixed[0], length, fixed[1], fixed[2])
-        passed, miss = beyond(y)
-        rate = field(fixed[0] + length, y, fixed[2])
-        rate = jnp.where(passed, rate[0], -rate[1])
-        low, high = jnp.where(miss < 0, length, low), jnp.where(miss < 0, high, length)
-        guess = length - miss / jnp.where(rate == 0, 1.0, rate)
-        better = jnp.where((guess >= low) & (guess <= high), guess, (low + high) / 2)
-        return low, high, better, jnp.abs(better - length), count + 1
-
-    def going(bracket):
-        *_, moved, count = bracket
-        return (moved > enough) & (count < MAX_EVENT_ITERATIONS)
-
-    # Half of the digits and some: the last step below, which carries derivatives, brings the others.
-    enough = eps_power(s, 5 / 8) * fixed[3]
-    begin = (jnp.zeros_like(fixed[3]), fixed[3], fixed[3] / 2, fixed[3], jnp.asarray(0, int))
-    length = jax.lax.while_loop(going, narrow, begin)[2]
-    y = step(phase_time, length, jnp.stack([s, w]), args)
-    rate = stop_gradient(field(phase_time + length, y, args))
-    # An object that comes to rest just at the goal does both: it lands on the one that is nearer in time.
+    phase_time, s, w = start
+    y, max_length = jnp.stack([s, w]), jnp.where(is_needed, end - phase_time, 0.0)
+    length = _length_to_event(*stop_gradient((ode, phase_time, y, max_length, s_stop)), w_stop, options, segment, row)
+    y = solver_step(*ode, options, segment, row, phase_time, y, length)
+    rate = stop_gradient(state_rate(ode, segment, row, phase_time + length, y))
+    # Choose the event that is nearer in time: an object that comes to rest just at the stop meets both.
     targets = jnp.stack([jnp.where(jnp.isfinite(s_stop), s_stop, 0.0), jnp.zeros_like(s_stop)])
-    lates = (targets - y) / jnp.where(wanted & (rate != 0), rate, 1.0)
-    possible = jnp.stack([jnp.isfinite(s_stop) & (rate[0] > 0), jnp.isfinite(w_stop) & (rate[1] < 0)])
-    which = jnp.argmin(jnp.where(possible, jnp.abs(stop_gradient(lates)), jnp.inf))
-    passed = wanted & (which == 0)
-    late = jnp.where(wanted, lates[which], 0.0)
-    failed = wanted & ~(jnp.abs(late) <= longest)
-    late = jnp.where(failed, 0.0, late)
-    y = y + rate * late
-    return (
-        phase_time + length + late,
-        jnp.where(passed, targets[0], y[0]),
-        jnp.where(passed, y[1], 0.0),
-        passed,
-        failed,
+    delays = (targets - y) / jnp.where(is_needed & (rate != 0), rate, 1.0)
+    is_possible = jnp.stack([jnp.isfinite(s_stop) & (rate[0] > 0), jnp.isfinite(w_stop) & (rate[1] < 0)])
+    event = jnp.argmin(jnp.where(is_possible, jnp.abs(stop_gradient(delays)), jnp.inf))
+    at_stop = is_needed & (event == 0)
+    # Correct time and state to first order.
+    delay = jnp.where(is_needed, delays[event], 0.0)
+    failed = is_needed & ~(jnp.abs(delay) <= max_length)
+    delay = jnp.where(failed, 0.0, delay)
+    y = y + rate * delay
+    return EventStep(
+        phase_time=phase_time + length + delay,
+        s=jnp.where(at_stop, targets[0], y[0]),
+        w=jnp.where(at_stop, y[1], 0.0),
+        at_stop=at_stop,
+        failed=failed,
     )
+
+
+def _length_to_event(
+    ode: PathODE, phase_time, y, max_length, s_stop, w_stop, options: IntegratorOptions, segment, row
+) -> Float[Array, ""]:
+    """Find the length of a step that ends on an event, to more than half of the digits: the correction after it brings
+    the others."""
+
+    def overshoot(length):
+        """How far a step goes past either event, and the rate at which that grows."""
+        y_end = solver_step(*ode, options, segment, row, phase_time, y, length)
+        past_stop, below_rest = y_end[0] - s_stop, w_stop - y_end[1]
+        rate = state_rate(ode, segment, row, phase_time + length, y_end)
+        return jnp.maximum(past_stop, below_rest), jnp.where(past_stop >= below_rest, rate[0], -rate[1])
+
+    tolerance = eps_power(max_length, 5 / 8) * max_length
+    length, _ = find_bracketed_root(overshoot, max_length, tolerance=tolerance, max_iterations=MAX_EVENT_ITERATIONS)
+    return length
