@@ -1,6 +1,7 @@
-"""What tests of several folders share: a torque that passes a path's end, derivatives against differences."""
+"""What tests of several folders share: scenes of layered hands, a torque that passes a path's end, differences."""
 
 import itertools
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -16,6 +17,17 @@ from wholearm_jax.phases import has_torque_jumps, margin
 from wholearm_jax.simulation import IntegratorOptions
 
 DURATION = 1.0
+LAYERED_SCENES = Path(__file__).parents[1] / "benchmarks" / "scenes"
+
+
+def layered_file(name: str) -> Path:
+    """The scene file of a plan whose fingers pass each other, in planes of their own; earlier numbers are its."""
+    return LAYERED_SCENES / f"{name}_layered.toml"
+
+
+def layered(name: str) -> wa.Scene:
+    """A plan whose fingers pass each other: `heptagon`, `hexagon`, `tipping`, `flight` or `passage`."""
+    return wa.load(layered_file(name))
 
 
 def passing(dynamics, knots=9):
@@ -81,8 +93,8 @@ def assert_modes_and_differences_agree(scene, torque, seed=3):
 
 def ending_at_its_kink(beyond):
     """The heptagon's flip alone, until `phi` is just beyond the place where a slip reverses, and that flip whole."""
-    data = to_dict(wa.load("heptagon"))
-    slide, flip = wa.trace(wa.load("heptagon"))
+    data = to_dict(layered("heptagon"))
+    slide, flip = wa.trace(layered("heptagon"))
     panel, xi = locate_panel(flip.dynamics, jnp.asarray(0), flip.dynamics.breakpoints[1])
     kink = evaluate(flip.dynamics.configuration, panel, xi)
     speed = evaluate(flip.dynamics.velocity, panel, xi)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 
@@ -33,7 +34,7 @@ def test_random_plans_at_speed_lead_on():
 
     from wholearm_jax.planning.successors import exit_velocity
 
-    scene = wa.load("flight")
+    scene = layered("flight")
     traced = wa.trace(scene)
     onward = list(chains(scene, traced[0].end, 1, exit_velocity(traced[0].dynamics)))
     assert all(way.status is wa.Status.OK and way.bound > 0 for (way,) in onward)

@@ -9,9 +9,10 @@ import sys
 import numpy as np
 import pytest
 import tomli_w
+from support import layered, layered_file
 
 from wholearm_jax.cli.output import write_result
-from wholearm_jax.files.scene_toml import bundled, load, to_dict
+from wholearm_jax.files.scene_toml import bundled, to_dict
 from wholearm_jax.model.schedule import TorqueSchedule, torque_schedule
 from wholearm_jax.phases.plan_simulation import simulate
 
@@ -29,7 +30,7 @@ def scene_file(tmp_path):
     """Write a scene like the heptagon's: changes of its dictionary -> path."""
 
     def write(change):
-        data = to_dict(load("heptagon"))
+        data = to_dict(layered("heptagon"))
         change(data)
         path = tmp_path / "scene.toml"
         path.write_text(tomli_w.dumps(data))
@@ -105,12 +106,14 @@ def test_bad_scene_file(name, wholearm, zero, scene_file):
 def test_bad_torque_file(wholearm, tmp_path):
     path = tmp_path / "torque.csv"
     path.write_text("t,tau1,tau2\n0,0,0\n2,much,0\n")
-    assert_bad_input(wholearm("simulate", "heptagon", "--torque", path), path, "line 3", "not three numbers")
+    assert_bad_input(
+        wholearm("simulate", layered_file("heptagon"), "--torque", path), path, "line 3", "not three numbers"
+    )
 
 
 def test_missing_torque_file(wholearm, tmp_path):
     path = tmp_path / "torque.csv"
-    assert_bad_input(wholearm("simulate", "heptagon", "--torque", path), path, "no such file")
+    assert_bad_input(wholearm("simulate", layered_file("heptagon"), "--torque", path), path, "no such file")
 
 
 @pytest.mark.parametrize("name", ["optimise", "simulate", "search"])
@@ -118,7 +121,9 @@ def test_output_folder_that_is_a_file(name, wholearm, zero, tmp_path):
     place = tmp_path / "out"
     place.write_text("in the way")
     more = ["--torque", zero] if name == "simulate" else []
-    assert_bad_input(wholearm(name, "heptagon", "--out", place, *more), "--out", place, "cannot be written")
+    assert_bad_input(
+        wholearm(name, layered_file("heptagon"), "--out", place, *more), "--out", place, "cannot be written"
+    )
     assert place.read_text() == "in the way"
 
 
@@ -139,11 +144,11 @@ def test_output_folder_that_is_a_file(name, wholearm, zero, tmp_path):
     ],
 )
 def test_bad_changes(change, cause, wholearm):
-    assert_bad_input(wholearm("optimise", "heptagon", "--set", change), f"--set {change}: ", cause)
+    assert_bad_input(wholearm("optimise", layered_file("heptagon"), "--set", change), f"--set {change}: ", cause)
 
 
 def test_torque_file_shorter_than_the_plan(wholearm, zero):
-    answer = wholearm("simulate", "heptagon", "--torque", zero, "--set", "1.duration=1.5")
+    answer = wholearm("simulate", layered_file("heptagon"), "--torque", zero, "--set", "1.duration=1.5")
     assert_bad_input(answer, zero, "covers 0 to 2 s, the plan 0 to 2.5 s")
 
 
@@ -194,7 +199,7 @@ def test_contacts_that_cannot_all_touch(change, key, contact, cause, wholearm, z
 
 @pytest.mark.parametrize("option", [("--rate-limit", 0.5), ("--passing", 0.5)])
 def test_what_robust_does_not_know(option, wholearm, tmp_path):
-    answer = wholearm("optimise", "heptagon", "--robust", "friction=20%", *option, "--out", tmp_path)
+    answer = wholearm("optimise", layered_file("heptagon"), "--robust", "friction=20%", *option, "--out", tmp_path)
     assert_bad_input(answer, f"--robust: knows no {option[0]}")
 
 
@@ -230,7 +235,7 @@ def test_contacts_that_cannot_all_touch_stop_every_command(name, wholearm, scene
 
 def test_plan_that_fails(wholearm, zero, tmp_path):
     out = tmp_path / "some" / "where"
-    code, printed, err = wholearm("simulate", "heptagon", "--torque", zero, "--out", out, "--samples", 5)
+    code, printed, err = wholearm("simulate", layered_file("heptagon"), "--torque", zero, "--out", out, "--samples", 5)
     assert code == 1
     assert err == ""
     assert printed.startswith("slide left: stuck, t = 1 s, at rest since 0 s: ")
@@ -275,7 +280,7 @@ def test_an_until_that_is_not_on_the_wire_is_noted(wholearm, zero, scene_file):
 def test_a_plan_that_fails_does_not_take_the_place_of_one_that_is_ok(record, wholearm, zero, tmp_path):
     for name, text in (("torque.csv", "old"), ("report.html", "old"), ("summary.json", f'{{"status": "{record}"}}')):
         (tmp_path / name).write_text(text)
-    code, out, err = wholearm("simulate", "heptagon", "--torque", zero, "--out", tmp_path)
+    code, out, err = wholearm("simulate", layered_file("heptagon"), "--torque", zero, "--out", tmp_path)
     assert code == 1
     stays = (tmp_path / "report.html").exists() and (tmp_path / "torque.csv").read_text() == "old"
     assert stays == (record == "ok")
@@ -285,7 +290,7 @@ def test_a_plan_that_fails_does_not_take_the_place_of_one_that_is_ok(record, who
 
 def test_a_result_without_torques_is_not_written(tmp_path, capsys):
     """As of phases that are too fast for the torques."""
-    scene = load("heptagon")
+    scene = layered("heptagon")
     plan = simulate(scene, torque_schedule([0.0, 2.0], np.zeros((2, 2))))
     undefined = dataclasses.replace(plan, torque=TorqueSchedule(plan.torque.times, plan.torque.values * np.nan))
     write_result(undefined, tmp_path, 5, as_json=False)
@@ -296,7 +301,7 @@ def test_a_result_without_torques_is_not_written(tmp_path, capsys):
 def test_nothing_of_an_earlier_result_stays_in_a_folder(wholearm, zero, tmp_path):
     for name in ("report.html", "plan.png", "mine.txt"):
         (tmp_path / name).write_text("of another time")
-    wholearm("simulate", "heptagon", "--torque", zero, "--out", tmp_path)
+    wholearm("simulate", layered_file("heptagon"), "--torque", zero, "--out", tmp_path)
     assert not (tmp_path / "report.html").exists()
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "mine.txt").exists()

@@ -5,14 +5,15 @@ import math
 
 import pytest
 import tomli_w
+from support import layered, layered_file
 
-from wholearm_jax.files.scene_toml import load, to_dict
+from wholearm_jax.files.scene_toml import to_dict
 
 SLIDE = ["palm:v5", "palm:v6", "finger1:v1", "finger2:v3"]
 
 
 def test_what_follows_a_phase(wholearm, tmp_path):
-    code, out, err = wholearm("formations", "heptagon", "--after", "0", "--json", "--out", tmp_path)
+    code, out, err = wholearm("formations", layered_file("heptagon"), "--after", "0", "--json", "--out", tmp_path)
     assert (code, err) == (0, "")
     answer = json.loads(out)
     assert set(SLIDE) < set(answer["touching"])
@@ -27,10 +28,10 @@ def test_what_follows_a_phase(wholearm, tmp_path):
 
 
 def test_rolling_formations_stand_beside_sliding_ones(wholearm):
-    code, out, _ = wholearm("formations", "tipping", "--json")
+    code, out, _ = wholearm("formations", layered_file("tipping"), "--json")
     assert code == 0
     rows = json.loads(out)["formations"]
-    planned = set(load("tipping").phases[0].formation.names)
+    planned = set(layered("tipping").phases[0].formation.names)
     assert any(name.endswith(" rolling") for name in planned)
     (same,) = {row["status"] for row in rows if set(row["contacts"]) == planned}
     assert same == "ok"
@@ -39,7 +40,7 @@ def test_rolling_formations_stand_beside_sliding_ones(wholearm):
 @pytest.mark.parametrize("width", [40, 120])
 def test_the_table_fits_and_has_poses(width, wholearm, monkeypatch):
     monkeypatch.setenv("COLUMNS", str(width))
-    code, out, _ = wholearm("formations", "heptagon")
+    code, out, _ = wholearm("formations", layered_file("heptagon"))
     assert code == 0
     assert max(map(len, out.splitlines())) <= width
     for word in ("ends at", "turn", "rolling", "palm:v5"):
@@ -48,7 +49,7 @@ def test_the_table_fits_and_has_poses(width, wholearm, monkeypatch):
 
 def test_a_scene_without_phases_lists_what_can_begin(wholearm, tmp_path):
     """The heptagon, laid in the hand roughly: its first phase is among what can begin, where its plan begins."""
-    data = to_dict(load("heptagon"))
+    data = to_dict(layered("heptagon"))
     del data["phase"]
     path = tmp_path / "scene.toml"
     path.write_text(tomli_w.dumps(data))
@@ -65,7 +66,7 @@ def test_a_scene_without_phases_lists_what_can_begin(wholearm, tmp_path):
 
 
 def test_other_commands_still_need_phases(wholearm, tmp_path):
-    data = to_dict(load("heptagon"))
+    data = to_dict(layered("heptagon"))
     del data["phase"]
     path = tmp_path / "scene.toml"
     path.write_text(tomli_w.dumps(data))

@@ -4,6 +4,7 @@ import json
 from importlib.metadata import version
 
 import pytest
+from support import layered_file
 
 from wholearm_jax.cli.tables import Column, print_json, print_table
 
@@ -55,6 +56,8 @@ def test_a_simulation_as_json(wholearm, tmp_path):
     """Standard output is the summary, as in its file, whatever becomes of the plan."""
     torque = tmp_path / "zero.csv"
     torque.write_text("t,tau1,tau2\n0,0,0\n2,0,0\n")
-    code, out, err = wholearm("simulate", "heptagon", "--torque", torque, "--json", "--out", tmp_path / "out")
+    code, out, err = wholearm(
+        "simulate", layered_file("heptagon"), "--torque", torque, "--json", "--out", tmp_path / "out"
+    )
     assert (code, err) == (1, "")
     assert json.loads(out) == json.loads((tmp_path / "out" / "summary.json").read_text())

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import optax
 import pytest
+from support import layered
 
 from wholearm_jax.core.result_structure import build_structure, describe_structure
 from wholearm_jax.dynamics import PathDynamics
-from wholearm_jax.files import load
 from wholearm_jax.phases import trace
 
 
@@ -49,7 +49,7 @@ def test_structures_come_back(tree):
 
 
 def test_a_traced_phase_comes_back():
-    traced = trace(load("heptagon"))
+    traced = trace(layered("heptagon"))
     structure = jax.tree.structure(traced)
     rebuilt = build_structure(json.loads(json.dumps(describe_structure(structure))))
     again = jax.tree.unflatten(rebuilt, jax.tree.leaves(traced))

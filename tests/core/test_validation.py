@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.ensembles.ensemble import make_ensemble
@@ -13,7 +14,7 @@ from wholearm_jax.execution.trials import Amounts, run_trials
 
 @pytest.fixture(scope="module")
 def plan():
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     torque = wa.torque_schedule([0.0, 2.0], [[0.0, 0.0], [0.0, 0.0]])
     return scene, torque, wa.simulate(scene, torque)
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.cli import app as command
@@ -36,7 +37,7 @@ ARRIVAL, SEED, COUNT = 0.02, 3, 6
 
 @pytest.fixture(scope="module")
 def scene():
-    return wa.load("heptagon")
+    return layered("heptagon")
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +138,7 @@ def test_polygons_of_different_size_stack(scene):
     both = stack_scenes([scene, nine])
     assert both.object.vertices.shape == (2, 16, 2)
     with pytest.raises(ValueError, match="same phases"):
-        stack_scenes([scene, wa.load("flight")])
+        stack_scenes([scene, layered("flight")])
 
 
 def test_amounts_that_are_not_are_refused(scene):
@@ -272,7 +273,7 @@ def test_what_a_store_is_of(tmp_path, scene, schedule):
     renamed = wa.parse(data | {"phase": [data["phase"][0] | {"name": "another"}, data["phase"][1]]})
     prints = {fingerprint(*trees) for trees in ([scene], [heavier], [renamed], [scene, schedule])}
     assert len(prints) == 4
-    assert fingerprint(scene) == fingerprint(wa.load("heptagon"))
+    assert fingerprint(scene) == fingerprint(layered("heptagon"))
 
 
 def test_a_store_left_half_made_is_made_again_and_a_half_written_chunk_is_not_done(tmp_path):

@@ -6,6 +6,7 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.ensembles.ensemble import make_ensemble
@@ -15,7 +16,7 @@ from wholearm_jax.model.scene import replace_duration
 
 @pytest.fixture(scope="module")
 def slide():
-    plan = wa.load("heptagon")
+    plan = layered("heptagon")
     return eqx.tree_at(lambda s: s.phases, plan, plan.phases[:1])
 
 

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 from matplotlib.path import Path as Outline
+from support import layered, layered_file
 
 import wholearm_jax as wa
 from wholearm_jax.ensembles.summary import wilson_interval
@@ -45,7 +46,7 @@ NAMES = ("heptagon", "hexagon")
 @pytest.fixture(scope="module")
 def predictions():
     """Both plans under torques that `wholearm optimise` found for 1 s a phase."""
-    return {name: wa.simulate(wa.load(name), wa.read_torque(DATA / f"{name}_torque.csv")) for name in NAMES}
+    return {name: wa.simulate(layered(name), wa.read_torque(DATA / f"{name}_torque.csv")) for name in NAMES}
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,7 @@ def executions(predictions):
 @pytest.mark.parametrize("name", NAMES)
 def test_distances_are_the_c_functions(name, predictions):
     """MuJoCo's distance of each pair equals its gap where one faces the other, to the rounding of its 32-bit meshes."""
-    scene, rng = wa.load(name), np.random.default_rng(0)
+    scene, rng = layered(name), np.random.default_rng(0)
     bodies = build_mujoco_model(scene, 2e-4)
     data = mujoco.MjData(bodies.model)
     several = contact_set(rigid_body(scene.object), scene.hand, contact_formation(bodies.names))
@@ -263,7 +264,7 @@ def test_a_plan_predicted_to_fail_fails(predictions):
 
 def test_a_plan_of_one_step():
     schedule = wa.torque_schedule([0.0, 1.0], [[0.0, 1.0], [2.0, 3.0]])
-    begins, step = clock(wa.load("heptagon"), 5.0)
+    begins, step = clock(layered("heptagon"), 5.0)
     assert (len(begins), step) == (1, 2.0)
     np.testing.assert_allclose(motor_torques(schedule, begins, step), [[2.0, 3.0]])
 
@@ -303,7 +304,7 @@ def test_small_changes_of_mass_do_no_harm(predictions):
 
 def test_a_copy_without_friction_can_be_told():
     """Of a coefficient of 0 any share is 0."""
-    scene = eqx.tree_at(lambda s: s.object.friction, wa.load("heptagon"), jnp.array([0.0, 0.1, 0.2]))
+    scene = eqx.tree_at(lambda s: s.object.friction, layered("heptagon"), jnp.array([0.0, 0.1, 0.2]))
     (changed,) = _draw_scenes(scene, Amounts(friction=0.1), 0, 1)
     told = _summary(scene, changed, np.zeros(5), np.zeros(5), ExecutionOutcome.OK)
     assert told.friction[0] == 1.0
@@ -401,7 +402,7 @@ def test_a_simulation_that_diverges_is_said(creep, why, predictions, monkeypatch
 
 
 def test_clock_divides_the_plan():
-    begins, step = clock(wa.load("heptagon"), 3e-4)
+    begins, step = clock(layered("heptagon"), 3e-4)
     assert len(begins) * step == pytest.approx(2.0, rel=1e-14)
     assert step == pytest.approx(3e-4, rel=1e-3)
 
@@ -427,7 +428,9 @@ TORQUE = ("--torque", DATA / "heptagon_torque.csv")
 
 
 def test_command(wholearm, tmp_path):
-    code, out, err = wholearm("execute", "heptagon", *TORQUE, "--timestep", 5e-4, "--perturb", 2, "--out", tmp_path)
+    code, out, err = wholearm(
+        "execute", layered_file("heptagon"), *TORQUE, "--timestep", 5e-4, "--perturb", 2, "--out", tmp_path
+    )
     assert code == 0
     assert "palm:v5 opened: 1.0050 s predicted" in out
     assert "of 2 perturbed executions succeed" in out
@@ -447,7 +450,7 @@ def test_command(wholearm, tmp_path):
 def test_a_contact_that_rolls_is_executed(wholearm, tmp_path):
     """An object tips over a vertex that should not slip, and back; nothing in the execution says that it must roll."""
     torque = ("--torque", DATA / "tipping_torque.csv")
-    code, out, err = wholearm("execute", "tipping", *torque, "--out", tmp_path)
+    code, out, err = wholearm("execute", layered_file("tipping"), *torque, "--out", tmp_path)
     assert (code, err) == (0, ""), out
     content = json.loads((tmp_path / "execution.json").read_text())
     assert content["position_error"] < 2e-5  # on its vertex it is unstable: what it starts with grows 400 times
@@ -489,7 +492,7 @@ def test_the_table_of_an_execution(executions, tmp_path):
     ],
 )
 def test_bad_options(more, cause, wholearm):
-    code, out, err = wholearm("execute", "heptagon", *TORQUE, *more)
+    code, out, err = wholearm("execute", layered_file("heptagon"), *TORQUE, *more)
     assert (code, out) == (2, "")
     assert cause in err
     assert err.count("\n") == 1
@@ -500,6 +503,6 @@ def test_missing_extra_is_one_clear_line(wholearm, monkeypatch):
     monkeypatch.delitem(sys.modules, "wholearm_jax.execution", raising=False)
     for name in ("mujoco_model", "coulomb_friction", "executions", "trials"):
         monkeypatch.delitem(sys.modules, f"wholearm_jax.execution.{name}", raising=False)
-    code, out, err = wholearm("execute", "heptagon", *TORQUE)
+    code, out, err = wholearm("execute", layered_file("heptagon"), *TORQUE)
     assert (code, out) == (2, "")
     assert err == "wholearm: execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'\n"

@@ -8,11 +8,12 @@ import pathlib
 import equinox as eqx
 import numpy as np
 import pytest
+from support import layered
 
 from wholearm_jax.core.atomic_files import write_atomically
 from wholearm_jax.core.status import Status
 from wholearm_jax.files.results import summary, write_summary, write_trajectory
-from wholearm_jax.files.scene_toml import load, parse, to_dict
+from wholearm_jax.files.scene_toml import parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan_simulation import simulate
 
@@ -24,7 +25,7 @@ HEADER = (
 @pytest.fixture(scope="module")
 def pushed():
     """The heptagon pushed to the left in two phases under constant torques, each arriving with the speed it has."""
-    data = to_dict(load("heptagon"))
+    data = to_dict(layered("heptagon"))
     slide = data["phase"][0] | {"arrive": "caught", "duration": 0.3}
     data["phase"] = [slide | {"name": "near", "until": {"x": 0.0}}, slide | {"name": "far"}]
     result = simulate(parse(data), torque_schedule([0.0, 0.3, 0.3, 0.6], [[0.55, -0.24]] * 2 + [[0.5, -0.1]] * 2))

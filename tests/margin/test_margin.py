@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
@@ -16,7 +17,7 @@ from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
 @pytest.fixture(scope="module")
 def heptagon():
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     return scene, wa.quasistatic(scene)
 
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import linprog
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.execution.executions import ExecutionOutcome, execute
@@ -132,7 +133,7 @@ def test_units_do_not_matter():
 @pytest.fixture(scope="module")
 def slide_hold_flip():
     """The heptagon's plan with a rest between its phases, and its wires."""
-    data = to_dict(wa.load("heptagon"))
+    data = to_dict(layered("heptagon"))
     slide, flip = data["phase"]
     pause = {"name": "pause", "contacts": slide["contacts"], "hold": True, "duration": 0.5}
     scene = wa.parse(data | {"phase": [slide, pause, flip]})
@@ -287,7 +288,7 @@ def test_steps_of_ten_per_cent_refuse_a_hold(slide_hold_flip):
 
 def test_motion_that_stops_holds_and_starts_again():
     """Pushed, braked to rest, held by a torque that changes, pushed on: each rest with the margin of its statics."""
-    slide = wa.load("heptagon")
+    slide = layered("heptagon")
     alone = eqx.tree_at(lambda s: s.phases, slide, slide.phases[:1])
     dynamics = wa.trace(alone)[0].dynamics
     push, brake, still = (

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import linprog
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.margin import BOUND_PLACES, BOUND_SPEEDS, MAX_SPEED_RATIO
@@ -59,7 +60,7 @@ def best_at(dynamics, duration, place, rests):
 @pytest.mark.parametrize("phase", [0, 1])
 def test_the_bound_is_the_least_of_the_best_forces(phase, duration, rests, limits):
     """Exactly that of intervals of speeds, and above what any of their speeds allows."""
-    scene = eqx.tree_at(lambda s: s.hand.torque_limit, wa.load("heptagon"), jnp.asarray(limits))
+    scene = eqx.tree_at(lambda s: s.hand.torque_limit, layered("heptagon"), jnp.asarray(limits))
     dynamics = wa.trace(scene)[phase].dynamics
     top = bound(dynamics, jnp.asarray(duration), jnp.asarray(rests), jnp.asarray(rests))
     value, tight = float(top.value), float(top.path_fraction)
@@ -74,7 +75,7 @@ def test_the_bound_is_the_least_of_the_best_forces(phase, duration, rests, limit
 @pytest.mark.parametrize(("name", "grip"), [("heptagon", 1.0), ("tipping", 0.2)])
 def test_bounds_leave_out_only_what_cannot_roll(name, grip):
     """At a fifth of its friction the tipping polygon is as good as slipping on either side."""
-    scene = wa.load(name)
+    scene = layered(name)
     scene = eqx.tree_at(lambda s: s.object.friction, scene, grip * scene.object.friction)
     traced = wa.trace(scene)
     for at, phase, top in zip(traced, scene.phases, wa.bounds(scene, traced=traced), strict=True):
@@ -87,7 +88,7 @@ def test_bounds_leave_out_only_what_cannot_roll(name, grip):
 @pytest.mark.parametrize("limits", [(1.0, 1.0), (0.4, 1.5)])
 def test_the_best_squeeze_is_within_limits(limits, idle, acceleration):
     """Where one finger alone drives the object the motion tells its torque, which may be beyond its limit."""
-    scene = eqx.tree_at(lambda s: s.hand.torque_limit, wa.load("heptagon"), jnp.asarray(limits))
+    scene = eqx.tree_at(lambda s: s.hand.torque_limit, layered("heptagon"), jnp.asarray(limits))
     dynamics = wa.trace(scene)[0].dynamics
     if idle:
         dynamics = eqx.tree_at(lambda t: t.acceleration, dynamics, dynamics.acceleration.at[..., 4].set(0.0))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from shapely import LineString, Point, Polygon
 from shapely.affinity import translate
+from support import layered
 
-import wholearm_jax as wa
 from wholearm_jax.model import link_obstacles, link_overlaps
 from wholearm_jax.model.hand_collisions import LINK_OBSTACLES, LinkMeeting
 from wholearm_jax.model.kinematics import contact_kinematics
@@ -20,7 +20,7 @@ COUNT = 400
 def hands():
     """Random hands, half of them of segments, with random joint angles."""
     rng = np.random.default_rng(0)
-    hand = wa.load("heptagon").hand
+    hand = layered("heptagon").hand
     strips = (rng.uniform(size=COUNT) < 0.5)[:, None]
     drawn = eqx.tree_at(
         lambda h: (h.joint, h.length, h.offset, h.back, h.layered),

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import layered
 
-import wholearm_jax as wa
 from wholearm_jax.model.kinematics import (
     constraint_jacobian,
     constraint_second_derivative,
@@ -26,7 +26,7 @@ NEAR = {"rtol": 1e-13, "atol": 1e-13}
 @pytest.fixture(scope="module", params=["heptagon", "tipping"])
 def mechanics(request):
     """A formation that slides, and one with a contact that rolls; its candidates are all groups of features."""
-    scene = wa.load(request.param)
+    scene = layered(request.param)
     return scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)
 
 

@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 import pytest
+from support import layered
 
 from wholearm_jax.files.scene_toml import load, parse, to_dict
 from wholearm_jax.model.outline import find_defect, remains_simple
@@ -102,7 +103,7 @@ def outline_of(count):
 
 
 def test_ten_thousand_vertices_take_less_than_a_second():
-    data = to_dict(load("heptagon"))
+    data = to_dict(layered("heptagon"))
     data["object"]["vertices"] = outline_of(10_000).tolist()
     begun = time.process_time()
     scene = parse(data)

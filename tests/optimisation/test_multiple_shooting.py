@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.margin import quasistatic as squeeze
@@ -26,7 +27,7 @@ def _simulate_one(dynamics, intervals, q):
 @pytest.fixture(scope="module")
 def flip():
     """The heptagon's flip, whose wire has a slip reversal near its end."""
-    dynamics = trace(wa.load("heptagon"))[1].dynamics
+    dynamics = trace(layered("heptagon"))[1].dynamics
     assert int(dynamics.count) == 2
     return dynamics
 
@@ -108,7 +109,7 @@ def test_derivatives_of_an_interval_that_is_cut(flip):
 @pytest.mark.parametrize(("knots", "late", "near"), [(31, 1e-9, 1e-8), (51, 1e-4, 1e-6)])
 def test_joined_intervals_are_the_phase(knots, late, near):
     """With two solver steps an interval, and with one: when that comes to rest is known to the square root of where."""
-    scene = wa.load("hexagon")
+    scene = layered("hexagon")
     scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
     found = wa.optimise(scene, knots=knots)
     dynamics, motion = found.result.phases[0].traced.dynamics, found.result.phases[0].outcome.motion

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
@@ -23,7 +24,7 @@ BOUNDS = {"heptagon": (0.966, 0.838), "hexagon": (0.694, 1.830)}
 
 @pytest.fixture(scope="module", params=BOUNDS)
 def optimised(request):
-    scene = wa.load(request.param)
+    scene = layered(request.param)
     return request.param, scene, wa.optimise(scene)
 
 
@@ -60,7 +61,7 @@ def test_history_says_what_happened(optimised):
 
 def test_a_start_that_leads_to_a_known_end_is_not_followed_to_it():
     """At this pace both phases stay below 99 % of their bounds, and a second start says whether that is all."""
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     for k in range(2):
         scene = eqx.tree_at(lambda s, k=k: s.phases[k].duration, scene, jnp.asarray(0.15))
     found = wa.optimise(scene)
@@ -108,7 +109,7 @@ def test_the_search_is_beaten_in_margin(optimised):
 @pytest.mark.parametrize("limits", [(0.4, 1.5), (1.5, 0.6)])
 def test_each_finger_has_its_own_limit(limits):
     """The flip's bound is 0.15 and 0.30 N: with limits exchanged it would not be reached, or exceeded."""
-    scene = eqx.tree_at(lambda s: s.hand.torque_limit, wa.load("heptagon"), jnp.asarray(limits))
+    scene = eqx.tree_at(lambda s: s.hand.torque_limit, layered("heptagon"), jnp.asarray(limits))
     found = wa.optimise(scene, knots=31)
     assert found.result.status is wa.Status.OK
     most = np.abs(np.asarray(found.torque.values)).max(0)
@@ -120,7 +121,7 @@ def test_each_finger_has_its_own_limit(limits):
 
 
 def test_rate_limits_hold_in_the_result():
-    scene = wa.load("hexagon")
+    scene = layered("hexagon")
     scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
     found = wa.optimise(scene, rate_limit=2.0)
     assert found.result.status is wa.Status.OK
@@ -129,7 +130,7 @@ def test_rate_limits_hold_in_the_result():
 
 
 def test_durations_are_free_within_their_range():
-    scene = wa.load("hexagon")
+    scene = layered("hexagon")
     scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
     fixed = wa.optimise(scene)
     free = wa.optimise(scene, durations=(0.5, 2.0))
@@ -141,7 +142,7 @@ def test_durations_are_free_within_their_range():
 
 
 def test_any_optax_optimiser_descends():
-    found = wa.optimise(wa.load("heptagon"), optimiser=optax.adam(3e-3), steps=100, knots=31)
+    found = wa.optimise(layered("heptagon"), optimiser=optax.adam(3e-3), steps=100, knots=31)
     flip = [step for step in found.history if step.phase == 1 and step.start == 0]
     joined = [step.margin for step in flip if step.defect_norm < 1e-3]
     assert joined[-1] > joined[0] + 0.02
@@ -151,7 +152,7 @@ def test_any_optax_optimiser_descends():
 
 
 def test_its_torques_do_not_step_where_a_formation_takes_over_at_speed():
-    scene = wa.load("passage")
+    scene = layered("passage")
     found = wa.optimise(scene, optimiser=optax.adam(0.02), steps=60, knots=31)
     first = [step.defect_norm for step in found.history if step.start == 0]
     assert first[0] > 0.1, "its start must have steps"
@@ -159,7 +160,7 @@ def test_its_torques_do_not_step_where_a_formation_takes_over_at_speed():
 
 
 def test_a_formation_that_cannot_be_held_is_said_before_any_search():
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     weak = eqx.tree_at(lambda s: s.hand.torque_limit, scene, jnp.full(2, 0.02))
     found = wa.optimise(weak)
     assert found.history == ()
@@ -223,7 +224,7 @@ HARD = {
 @pytest.mark.parametrize("case", HARD)
 def test_hard_phases(case):
     vertices, (mass, friction), start, phase, least = HARD[case]
-    data = to_dict(wa.load("heptagon"))
+    data = to_dict(layered("heptagon"))
     data["object"] = {"vertices": list(zip(*vertices, strict=True)), "mass": mass, "friction": friction}
     data["start"] = dict(zip(("x", "y", "phi", "theta1", "theta2"), start, strict=True))
     data["phase"] = [{"name": "on", **phase}]
@@ -234,7 +235,7 @@ def test_hard_phases(case):
 
 def test_a_phase_that_brakes_to_the_last_ends_on_time():
     """It comes to rest and to the wire's end at once: whichever is met first, the time is that of the phase."""
-    data = to_dict(wa.load("heptagon"))
+    data = to_dict(layered("heptagon"))
     contacts = ["palm:v0", "palm:v6", "finger1:v1", "finger2:v3"]
     data["phase"].append({"name": "slide on", "contacts": contacts, "toward": "theta1-", "duration": 1.0})
     result = wa.optimise(wa.parse(data)).result

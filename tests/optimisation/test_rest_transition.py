@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.dynamics import evaluate, locate_panel
@@ -28,7 +29,7 @@ def at_rest(dynamics, segment, s, torque):
 @pytest.fixture(scope="module", params=["heptagon", "hexagon"])
 def change(request):
     """A bundled plan's change of formation: the wire that ends, the rest there, and the motion that follows."""
-    scene = wa.load(request.param)
+    scene = layered(request.param)
     traced = wa.trace(scene)
     first, second = (float(top.value) for top in wa.bounds(scene, traced=traced))
     before, onward = Moving(traced[0].dynamics, 1.0, first), Moving(traced[1].dynamics, 1.0, second)
@@ -96,7 +97,7 @@ def test_a_torque_out_of_reach_is_none(change):
     ],
 )
 def test_whole_plans_keep_a_limited_rate(name, duration, rate):
-    scene = wa.load(name)
+    scene = layered(name)
     phases = tuple(replace_duration(phase, duration) for phase in scene.phases)
     found = wa.optimise(eqx.tree_at(lambda s: s.phases, scene, phases), rate_limit=rate)
     assert found.result.status is wa.Status.OK, found.result.message
@@ -108,7 +109,7 @@ def test_whole_plans_keep_a_limited_rate(name, duration, rate):
 
 
 def test_an_object_that_is_held_between_phases_sets_out_at_a_limited_rate():
-    data = to_dict(wa.load("heptagon"))
+    data = to_dict(layered("heptagon"))
     slide, flip = data["phase"]
     pause = {"name": "pause", "contacts": slide["contacts"], "hold": True, "duration": 0.5}
     found = wa.optimise(wa.parse(data | {"phase": [slide, pause, flip]}), rate_limit=3.0)
@@ -119,7 +120,7 @@ def test_an_object_that_is_held_between_phases_sets_out_at_a_limited_rate():
 
 
 def test_where_no_torques_serve_the_reason_is_told():
-    found = wa.optimise(wa.load("heptagon"), rate_limit=0.2)
+    found = wa.optimise(layered("heptagon"), rate_limit=0.2)
     assert found.result.status is not wa.Status.OK
     assert found.result.phases[0].status is wa.Status.OK
     assert found.stopped[1] == "no torque lets this formation take over at the limited rate"
@@ -127,4 +128,4 @@ def test_where_no_torques_serve_the_reason_is_told():
 
 def test_a_rate_limit_is_positive():
     with pytest.raises(ValueError, match="rate_limit must be positive"):
-        wa.optimise(wa.load("heptagon"), rate_limit=0.0)
+        wa.optimise(layered("heptagon"), rate_limit=0.0)

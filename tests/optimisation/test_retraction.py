@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import layered
 
-import wholearm_jax as wa
 from wholearm_jax.optimisation.constraints import Limits
 from wholearm_jax.optimisation.retraction import retract
 from wholearm_jax.optimisation.variables import Variables
@@ -14,7 +14,7 @@ from wholearm_jax.phases import trace
 
 @pytest.fixture(scope="module")
 def flip():
-    return trace(wa.load("heptagon"))[1].dynamics
+    return trace(layered("heptagon"))[1].dynamics
 
 
 def test_a_curved_step_starts_along_its_direction_and_keeps_fixed_torques(flip):

@@ -4,8 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import layered
 
-import wholearm_jax as wa
 from wholearm_jax.core.arrays import as_device_array
 from wholearm_jax.optimisation.constraints import Limits
 from wholearm_jax.optimisation.coupled_phases import stack_dynamics
@@ -23,7 +23,7 @@ linearise_jit, kkt_step_jit = eqx.filter_jit(linearise), eqx.filter_jit(kkt_step
 def _problem(name, count, *, free):
     """A linearised problem of `count` phases at speed, its torques random; `free` lets durations change."""
     rng = np.random.default_rng(5)
-    phase_dynamics = stack_dynamics([at.dynamics for at in trace(wa.load(name))[:count]])
+    phase_dynamics = stack_dynamics([at.dynamics for at in trace(layered(name))[:count]])
     places = np.broadcast_to(np.linspace(0.0, 1.0, KNOTS), (count, KNOTS))
     state = np.stack([places, rng.uniform(0.5, 1.5, (count, KNOTS))], axis=2)
     p = Variables(*map(as_device_array, (rng.uniform(-0.5, 0.5, (count, KNOTS, 2)), state, np.zeros(count))))

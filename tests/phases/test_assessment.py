@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.dynamics import Impact
@@ -19,7 +20,7 @@ EDGE = 1e-3  # how far from an edge the cases stand, relatively
 
 @pytest.fixture(scope="module")
 def dynamics():
-    return wa.trace(wa.load("heptagon"))[0].dynamics
+    return wa.trace(layered("heptagon"))[0].dynamics
 
 
 def moved(dynamics, ended, short=0.0, speed=0.0, phase_time=1.0, rests=None):

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.dynamics import evaluate, locate_panel, resolve_impact
@@ -22,7 +23,7 @@ FLIGHTS = ("flight", "passage")
 
 @pytest.fixture(scope="module", params=FLIGHTS)
 def flown(request):
-    return wa.optimise(wa.load(request.param), knots=31)
+    return wa.optimise(layered(request.param), knots=31)
 
 
 def test_three_formations_without_a_stop(flown):
@@ -114,7 +115,7 @@ def test_derivatives_pass_through_the_changes(flown):
 
 
 def test_a_change_that_would_throw_the_object_back_is_refused_by_name():
-    scene = wa.load("heptagon")  # the slide goes left, the flip right: no impact turns one into the other
+    scene = layered("heptagon")  # the slide goes left, the flip right: no impact turns one into the other
     flying = eqx.tree_at(lambda s: s.phases[0], scene, _flying(scene.phases[0]))
     found = wa.optimise(scene, knots=31)
     hasty = eqx.tree_at(lambda t: t.values, found.torque, found.torque.values.at[:31, 0].multiply(1.02))
@@ -131,7 +132,7 @@ def _flying(phase):
 @pytest.mark.parametrize("x", [0.0, -0.01, -0.015, -0.018])
 def test_a_motion_cut_in_two_goes_on_as_it_was(x):
     """The second part is entered fast and its wire is a fraction of a step: no overshoot, no impulse, the same end."""
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     slide = scene.phases[0]
     torque = wa.TorqueSchedule(jnp.array([0.0, 0.6, 1.2]), jnp.array([[0.55, -0.24], [0.55, -0.24], [0.55, -0.24]]))
 

@@ -4,6 +4,7 @@ import math
 
 import equinox as eqx
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.phases.gradients import DirectionalDerivative, _most_stable, check_gradient
@@ -11,7 +12,7 @@ from wholearm_jax.phases.gradients import DirectionalDerivative, _most_stable, c
 
 @pytest.fixture(scope="module")
 def slide():
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     scene = eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1])
     return scene, wa.quasistatic(scene)
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import steadiest_difference
+from support import layered, steadiest_difference
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
@@ -31,7 +31,7 @@ def thinned(torque, rows):
     ("rows", "expected"), [(MAX_FORWARD_DIRECTIONS, "forward"), (MAX_FORWARD_DIRECTIONS + 1, "reverse")]
 )
 def test_both_modes_agree_with_differences(rows, expected):
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     schedule, traced = thinned(wa.read_torque(DATA / "heptagon_torque.csv"), rows), wa.trace(scene)
     assert choose_mode(schedule) == expected
     margin, slope = torque_gradient(scene, schedule, traced=traced)
@@ -49,7 +49,7 @@ def test_both_modes_agree_with_differences(rows, expected):
 
 def test_who_arrives_early_in_a_batch_keeps_its_gradient():
     """What a batch computes for members that have finished must not turn their derivatives into NaN."""
-    data = to_dict(wa.load("heptagon"))
+    data = to_dict(layered("heptagon"))
     scene = wa.parse(data | {"phase": [data["phase"][0] | {"arrive": "caught", "duration": 4.0}]})
     traced, options = wa.trace(scene), wa.IntegratorOptions(adjoint=Adjoint.BOTH)
     times = jnp.linspace(0.0, 4.0, 5)

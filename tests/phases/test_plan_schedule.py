@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.files.torque_csv import read_torque
@@ -27,7 +28,7 @@ def schedule(last, rows=5):
 )
 @pytest.mark.parametrize("function", [wa.simulate, lambda scene, torque: wa.check([scene], torque), wa.margin])
 def test_a_schedule_that_cannot_be_followed_is_refused_at_once(function, row, column, value, cause):
-    scene, start = wa.load("heptagon"), schedule(2.0)
+    scene, start = layered("heptagon"), schedule(2.0)
     if column is None:
         torque = wa.TorqueSchedule(start.times.at[row].set(value), start.values)
     else:
@@ -48,12 +49,12 @@ def test_a_schedule_that_cannot_be_followed_is_refused_at_once(function, row, co
     ],
 )
 def test_a_schedule_much_longer_than_its_plan_is_noted(last, noted):
-    message = note_on_length(wa.load("heptagon"), schedule(last))
+    message = note_on_length(layered("heptagon"), schedule(last))
     assert message == (noted and f"the torque schedule {noted}")
 
 
 def test_the_case_in_milliseconds(wholearm):
     path = Path(__file__).parents[1] / "data" / "cases" / "torque_ms.csv"
-    assert "in milliseconds?" in note_on_length(wa.load("heptagon"), read_torque(path))
+    assert "in milliseconds?" in note_on_length(layered("heptagon"), read_torque(path))
     _, _, errors = wholearm("simulate", "heptagon", "--torque", path)
     assert f"note: {path}: the torque schedule goes on to 2000 s" in errors

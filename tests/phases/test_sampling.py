@@ -3,6 +3,7 @@
 import equinox as eqx
 import numpy as np
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.model.scene import Arrival, replace_duration
@@ -23,7 +24,7 @@ def assert_moves_as_it_says(course):
 @pytest.fixture(scope="module")
 def early():
     """A phase that is pushed to its wire's end in half of its time, and caught there."""
-    found = wa.search_by_steps(wa.load("hexagon"))
+    found = wa.search_by_steps(layered("hexagon"))
     phase = found.scene.phases[0]
     taken = float(phase.duration)
     scene = eqx.tree_at(lambda s: s.phases, found.scene, (replace_duration(phase, 2 * taken),))
@@ -48,7 +49,7 @@ def test_who_is_caught_early_rests_where_the_wire_ends(early):
 
 
 def test_phases_that_pass_on_at_speed_are_sampled_until_they_do():
-    result = wa.optimise(wa.load("flight")).result
+    result = wa.optimise(layered("flight")).result
     assert result.status is wa.Status.OK, result.message
     courses = wa.trajectory(result, SAMPLES)
     for phase, course in zip(result.phases, courses, strict=True):
@@ -64,7 +65,7 @@ def test_phases_that_pass_on_at_speed_are_sampled_until_they_do():
 
 def test_torques_are_those_of_the_schedule_while_the_object_waits():
     """A wait is one step of the motion, however many knots the schedule has meanwhile."""
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     push = wa.quasistatic(scene)
     weak = np.asarray(push.values)[:1] * np.array([0.1, 0.3, 0.05, 0.2])[:, None]
     times = np.concatenate([[0.0, 0.1, 0.2, 0.3, 0.3], [1.0, 1.0, 2.0]])

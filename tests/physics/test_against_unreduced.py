@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from support import DURATION, passing
+from support import DURATION, layered, passing
 
 import wholearm_jax
 from tests.reference import unreduced
@@ -30,7 +30,7 @@ def configurations(dynamics, s):
 
 def other_hand():
     """Offset links, unlike fingers, an inertia of its own, tilted gravity, another friction for each link."""
-    data = scene_file.to_dict(wholearm_jax.load("heptagon"))
+    data = scene_file.to_dict(layered("heptagon"))
     data["hand"]["finger1"] |= {"offset": 0.006, "length": 0.18, "inertia": 3e-3, "viscous": 0.03, "dry": 0.02}
     data["hand"]["finger2"] |= {"offset": 0.004, "inertia": 1.5e-3, "viscous": 0.01, "dry": 0.005}
     data["object"] |= {"friction": {"palm": 0.2, "finger1": 0.05, "finger2": 0.12}, "inertia": 1.5e-4}
@@ -39,8 +39,8 @@ def other_hand():
 
 
 SCENES = {
-    "heptagon": lambda: wholearm_jax.load("heptagon"),
-    "hexagon": lambda: wholearm_jax.load("hexagon"),
+    "heptagon": lambda: layered("heptagon"),
+    "hexagon": lambda: layered("hexagon"),
     "other hand": other_hand,
 }
 # Reversals on the way: the slip of contact 1 (`finger1:v1`) late in the heptagon's flip.
@@ -171,7 +171,7 @@ def test_own_derivatives(contacts):
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])
 def test_start_after_waiting(name, phase):
     """Friction holds the object until the torque has risen enough: it starts at that time, from there."""
-    scene = wholearm_jax.load(name)
+    scene = layered(name)
     dynamics = wholearm_jax.trace(scene)[phase].dynamics
     later, delay = passing(dynamics), 0.3
     held = squeeze.best_quasistatic_torque(
@@ -212,7 +212,7 @@ def test_start_after_waiting(name, phase):
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])
 def test_which_way_an_object_at_rest_sets_out(name, phase):
     """With friction 0.5 the other simulation's accelerations, each with its own friction, allow either way, or both."""
-    data = scene_file.to_dict(wholearm_jax.load(name))
+    data = scene_file.to_dict(layered(name))
     data["object"]["friction"] = 0.5
     dynamics = wholearm_jax.trace(wholearm_jax.parse(data))[phase].dynamics
     model = unreduced.Model(data, data["phase"][phase]["contacts"])
@@ -246,8 +246,8 @@ def test_which_way_an_object_at_rest_sets_out(name, phase):
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])
 def test_wedged(name, phase):
     """Friction that turns the sign of the other simulation's determinant on the wire is told, and no other."""
-    data = scene_file.to_dict(wholearm_jax.load(name))
-    free = wholearm_jax.trace(wholearm_jax.load(name))[phase].dynamics
+    data = scene_file.to_dict(layered(name))
+    free = wholearm_jax.trace(layered(name))[phase].dynamics
     ends = np.asarray(free.breakpoints)[[0, -1]]
     places = ends[0] + np.ptp(ends) * np.linspace(0.0, 1.0, 101)
     found = []

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_modes_and_differences_agree, ending_at_its_kink
+from support import assert_modes_and_differences_agree, ending_at_its_kink, layered
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
@@ -18,7 +18,7 @@ from wholearm_jax.simulation import Adjoint, IntegratorOptions, simulate_motion
 
 def one_phase(name, row, push, change=lambda data: None, duration=0.6):
     """A scene with one phase of a bundled plan, starting where that phase starts, and torques that carry it out."""
-    scene = wa.load(name)
+    scene = layered(name)
     if row:
         end = wa.trace(scene)[0]
         start = end.end

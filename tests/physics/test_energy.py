@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import DURATION, passing
+from support import DURATION, layered, passing
 
 import wholearm_jax
 from wholearm_jax.model.kinematics import contact_set, tangential_jacobian
@@ -19,7 +19,7 @@ NODES = 8  # Gauss-Legendre points a step
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])
 def test_balance(name, phase):
     """Powers integrated over every step of a passage of the wire against the change of energy."""
-    scene = wholearm_jax.load(name)
+    scene = layered(name)
     solid, hand = rigid_body(scene.object), scene.hand
     several = contact_set(solid, hand, scene.phases[phase].formation)
     dynamics = wholearm_jax.trace(scene)[phase].dynamics

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.path import Path
-from support import steadiest_difference
+from support import layered, steadiest_difference
 
 import wholearm_jax as wa
 from wholearm_jax.dynamics import equations_of_motion, evaluate, locate_panel, placeholder_dynamics
@@ -153,7 +153,7 @@ def test_a_wire_that_meets_another_is_singular():
 
 def test_wedging_on_the_way_back_does_not_spoil_the_table():
     """Backward accelerations keep their sign through a place where friction would wedge an object going back."""
-    name = wa.load("heptagon")
+    name = layered("heptagon")
     end = wa.trace(name)[1].end
     rough = eqx.tree_at(lambda s: s.object.friction, name, jnp.full(3, 0.7))
     phase = rough.phases[1]
@@ -392,7 +392,7 @@ def test_too_few_steps_are_always_said():
 
 def test_a_motion_may_stop_and_go_on_often():
     """Pushes and pauses, twelve of each: more stages than a phase usually has."""
-    slide = wa.load("heptagon")
+    slide = layered("heptagon")
     dynamics = wa.trace(slide)[0].dynamics
     push = np.asarray(best_quasistatic_torque(dynamics, dynamics.breakpoints[0], 0.0, 3.0).torque)
     brake = np.asarray(best_quasistatic_torque(dynamics, dynamics.breakpoints[0], 0.0, -6.0).torque)

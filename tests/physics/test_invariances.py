@@ -5,7 +5,7 @@ import copy
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import passing
+from support import layered, passing
 
 import wholearm_jax
 from wholearm_jax.files import scene_toml as scene_file
@@ -61,7 +61,7 @@ def assert_same(found, expected):
 @pytest.fixture(scope="module", params=NAMES)
 def original(request):
     """A bundled scene as a dict, torques that carry it along both its wires, and what comes of it."""
-    data = scene_file.to_dict(wholearm_jax.load(request.param))
+    data = scene_file.to_dict(layered(request.param))
     # Unlike fingers and frictions, so that a mixed-up side shows, and no number that scales as zero.
     data["hand"]["finger1"] |= {"dry": 0.009, "viscous": 0.021, "inertia": 2.1e-3, "offset": 0.002}
     data["hand"]["finger2"] |= {"offset": 0.001}

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_modes_and_differences_agree, passing
+from support import assert_modes_and_differences_agree, layered, passing
 
 import wholearm_jax
 from tests.reference import unreduced
@@ -32,7 +32,7 @@ DURATION = 1.0
 
 def tipping(contacts=None, toward=None, **start):
     """The bundled scene as a dict, one phase of it, perhaps with other contacts from another start."""
-    data = scene_file.to_dict(wholearm_jax.load("tipping"))
+    data = scene_file.to_dict(layered("tipping"))
     data["phase"] = data["phase"][:1]
     data["phase"][0] |= {"duration": DURATION} | ({"contacts": contacts} if contacts else {})
     data["phase"][0] |= {"toward": toward} if toward else {}
@@ -331,7 +331,7 @@ def test_mirror_image():
 
 def test_bundled_plan_is_optimised():
     """Both ways over the vertex, within 3 % of the bound."""
-    found = wholearm_jax.optimise(wholearm_jax.load("tipping"))
+    found = wholearm_jax.optimise(layered("tipping"))
     assert found.result.status is wholearm_jax.Status.OK, found.result.message
     assert min(found.bound_fraction) >= 0.97
     assert max(found.bound_fraction) <= 1.0

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 
@@ -13,7 +14,8 @@ DATA = Path(__file__).parents[1] / "data"
 PROGRAM = """
 import sys
 import wholearm_jax as wa
-scene, torque = wa.load("heptagon"), wa.read_torque(sys.argv[1])
+from support import layered
+scene, torque = layered("heptagon"), wa.read_torque(sys.argv[1])
 traced = wa.trace(scene)
 print(traced[0].dynamics.breakpoints.dtype, *(int(one.dynamics.status) for one in traced))
 print(float(wa.margin(scene, torque, options=wa.IntegratorOptions(tolerance=1e-5))))
@@ -27,11 +29,12 @@ except RuntimeError as error:
 def test_margins_in_single_precision():
     schedule = DATA / "heptagon_torque.csv"
     surroundings = {name: value for name, value in os.environ.items() if name != "JAX_ENABLE_X64"}
+    surroundings["PYTHONPATH"] = os.pathsep.join(sys.path)  # `support`
     command = [sys.executable, "-c", PROGRAM, str(schedule)]
     done = subprocess.run(command, env=surroundings, capture_output=True, text=True, check=True)
     traced, margin, refusal = done.stdout.splitlines()
     assert traced == "float32 0 0"
-    exact = wa.simulate(wa.load("heptagon"), wa.read_torque(schedule)).margin
+    exact = wa.simulate(layered("heptagon"), wa.read_torque(schedule)).margin
     assert float(margin) == pytest.approx(exact, rel=1e-4)
     assert float(margin) != exact
     assert "float64" in refusal
@@ -40,14 +43,16 @@ def test_margins_in_single_precision():
 DEFAULTS = """
 import sys
 import wholearm_jax as wa
+from support import layered
 for name, torque in zip(("heptagon", "hexagon", "tipping"), sys.argv[1:]):
-    print(float(wa.margin(wa.load(name), wa.read_torque(torque))))
+    print(float(wa.margin(layered(name), wa.read_torque(torque))))
 """
 
 
 def run(program, *arguments):
     """Run a program in 32 bits, and return what it prints."""
     surroundings = {name: value for name, value in os.environ.items() if name != "JAX_ENABLE_X64"}
+    surroundings["PYTHONPATH"] = os.pathsep.join(sys.path)  # `support`
     command = [sys.executable, "-c", program, *map(str, arguments)]
     return subprocess.run(command, env=surroundings, capture_output=True, text=True, check=True).stdout.splitlines()
 
@@ -57,7 +62,7 @@ def test_margins_in_single_precision_at_the_defaults():
     schedules = [DATA / f"{name}_torque.csv" for name in names]
     margins = map(float, run(DEFAULTS, *schedules))
     for name, schedule, margin in zip(names, schedules, margins, strict=True):
-        exact = wa.simulate(wa.load(name), wa.read_torque(schedule)).margin
+        exact = wa.simulate(layered(name), wa.read_torque(schedule)).margin
         assert margin == pytest.approx(exact, rel=1e-4)
         assert margin != exact
 
@@ -70,7 +75,7 @@ from wholearm_jax.ensembles import make_ensemble, optimise_robustly
 from wholearm_jax.phases.gradients import check_gradient, torque_gradient
 from wholearm_jax.planning import successor_formations, touching_contacts
 
-scene, torque = wa.load("heptagon"), wa.torque_schedule([0.0, 2.0], [[0.5, -0.2], [0.5, -0.2]])
+scene, torque = layered("heptagon"), wa.torque_schedule([0.0, 2.0], [[0.5, -0.2], [0.5, -0.2]])
 ensemble = make_ensemble(scene, {"friction": "10%"})
 CALLS = {
     "simulate": lambda: wa.simulate(scene, torque),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.planning.successors import exit_velocity, successor_formations, touching_contacts
@@ -9,7 +10,7 @@ from wholearm_jax.planning.successors import exit_velocity, successor_formations
 
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])
 def test_the_planned_phases_are_among_the_ways(name):
-    scene = wa.load(name)
+    scene = layered(name)
     traced = wa.trace(scene)
     places = [traced[0].begin, traced[0].end]
     tops = wa.bounds(scene, traced=traced)
@@ -24,7 +25,7 @@ def test_the_planned_phases_are_among_the_ways(name):
 
 
 def test_a_fifth_contact_stops_the_ways_that_would_push_into_it():
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     z = wa.trace(scene)[0].end
     assert "finger2:v4" in touching_contacts(scene, z)
     old = [way for way in successor_formations(scene, z) if set(way.contacts) == set(scene.phases[0].formation.names)]
@@ -32,7 +33,7 @@ def test_a_fifth_contact_stops_the_ways_that_would_push_into_it():
 
 
 def test_impacts_are_told():
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     end = wa.trace(scene)[0]
     found = successor_formations(scene, end.end, exit_velocity(end.dynamics))
     flip = next(way for way in found if set(way.contacts) == set(scene.phases[1].formation.names))

@@ -4,8 +4,9 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from support import layered
 
-from wholearm_jax.files.scene_toml import load, parse, to_dict
+from wholearm_jax.files.scene_toml import parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan_simulation import simulate
 from wholearm_jax.plotting.palette import CONTACT_COLOURS, DASHES, contact_styles
@@ -19,7 +20,7 @@ mpl.use("agg")
 @pytest.fixture(scope="module")
 def pushed():
     """The heptagon pushed to the left under constant torques."""
-    data = to_dict(load("heptagon"))
+    data = to_dict(layered("heptagon"))
     data["phase"] = [data["phase"][0] | {"arrive": "caught", "duration": 0.3}]
     return simulate(parse(data), torque_schedule([0.0, 0.3], [[0.55, -0.24]] * 2))
 

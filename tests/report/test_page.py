@@ -6,10 +6,11 @@ import shutil
 
 import numpy as np
 import pytest
+from support import layered
 
 from wholearm_jax.core.errors import SceneError
 from wholearm_jax.files.results import summary, write_summary, write_torque, write_trajectory
-from wholearm_jax.files.scene_toml import load, parse, to_dict
+from wholearm_jax.files.scene_toml import parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan_simulation import simulate
 from wholearm_jax.report.page import render, report
@@ -23,7 +24,7 @@ TITLE = "a <b>heptagon</b> </script><script>throw 1</script>"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """The heptagon pushed to the left in two phases under constant torques, written as the command line does."""
-    data = to_dict(load("heptagon"))
+    data = to_dict(layered("heptagon"))
     slide = data["phase"][0] | {"arrive": "caught", "duration": 0.3}
     data["phase"] = [slide | {"name": "near", "until": {"x": 0.0}}, slide | {"name": "far"}]
     data["title"] = TITLE

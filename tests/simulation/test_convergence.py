@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.core.status import Status
@@ -79,7 +80,7 @@ def test_an_object_that_rests_within_a_step_is_stopped_and_set_out_again():
     """At 0.27 of the second phase it comes to rest for an eightieth, less than a step of most tolerances: the speed at
     steps' ends shows nothing, and carried on the object would slide back with the friction of forward travel."""
     varied = {"vertices": 0.0006, "friction": "60%", "mass": "20%"}
-    scene = make_ensemble(wa.load("heptagon"), varied, seed=1).draw(1107)
+    scene = make_ensemble(layered("heptagon"), varied, seed=1).draw(1107)
     schedule = wa.read_torque(Path(__file__).parents[2] / "benchmarks" / "data" / "heptagon_knots.csv")
     traced = wa.trace(scene)
     margins = []

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq, fsolve
-from support import steadiest_difference
+from support import layered, steadiest_difference
 
 import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
@@ -19,7 +19,7 @@ from wholearm_jax.tracing import PathEnd, Resolution
 
 def coplanar(name="heptagon", length=0.14, offset=0.0, back=0.0, phases=slice(None), **start):
     """A bundled object on a hand whose fingers share a plane."""
-    data = to_dict(wa.load(name))
+    data = to_dict(layered(name))
     data["hand"]["fingers"] = "coplanar"
     for finger in ("finger1", "finger2"):
         data["hand"][finger] |= {"length": length, "offset": offset, "back": back}

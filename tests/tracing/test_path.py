@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import ending_at_its_kink
+from support import ending_at_its_kink, layered
 
 import wholearm_jax as wa
 from wholearm_jax.dynamics import evaluate, evaluate_dot, locate_panel
@@ -26,7 +26,7 @@ ENDS = {
 
 @pytest.fixture(scope="module", params=ENDS)
 def traced(request):
-    scene = wa.load(request.param)
+    scene = layered(request.param)
     mechanics = [
         scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, p.formation) for p in scene.phases
     ]
@@ -82,7 +82,7 @@ def test_slips_vanish_where_pieces_meet(traced):
 
 
 def changed(name, **phase):
-    data = to_dict(wa.load(name))
+    data = to_dict(layered(name))
     data["phase"] = [data["phase"][0] | phase]
     return wa.parse(data)
 
@@ -114,7 +114,7 @@ def test_the_other_way_along_the_wire():
 
 
 def test_a_start_that_no_contact_can_reach_is_refused_by_status():
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     far = eqx.tree_at(lambda s: s.hand.joint, scene, jnp.array([[2.0, 0.0], [-2.0, 0.0]]))
     assert int(wa.trace(far)[0].dynamics.status) in (wa.Status.NO_CONVERGENCE, wa.Status.LEFT_FORMATION)
 
@@ -140,7 +140,7 @@ def test_statuses_name_what_happened():
 
 
 def test_a_wire_passes_the_turning_point_of_theta1():
-    data = to_dict(wa.load("heptagon"))
+    data = to_dict(layered("heptagon"))
     contacts = ["palm:v0", "finger1:v3", "finger2:v5", "finger2:v6"]
     data["phase"] = [{"name": "turn", "contacts": contacts, "toward": "phi-", "duration": 1.0}]
     data["start"] = {"x": -0.0219, "y": 0.038, "phi": -1.0551, "theta1": 1.6714, "theta2": 1.133}
@@ -216,7 +216,7 @@ def at_places(dynamics, shares):
 @pytest.mark.parametrize("phase", [0, 1])
 def test_a_table_knows_its_error(phase):
     """Against one with many panels, relative to each function's size; where it is told, it is not told for nothing."""
-    scene, shares = wa.load("heptagon"), jnp.linspace(0.001, 0.999, 333)
+    scene, shares = layered("heptagon"), jnp.linspace(0.001, 0.999, 333)
     fine = at_places(traced_with(scene, phase, Resolution().panels), shares)
     told = []
     for panels in (8, 16):
@@ -258,7 +258,7 @@ def test_panels_go_where_the_wire_is_long(lengths, panels):
 
 def test_tables_are_refined_until_they_are_good_enough_or_refused():
     """A wire on which friction nearly wedges the object has functions that 512 panels do not serve."""
-    scene, few = wa.load("heptagon"), Resolution(panels=8)
+    scene, few = layered("heptagon"), Resolution(panels=8)
     panels = {}
     for tolerance in (1e-4, 1e-9):
         phase_dynamics = [one.dynamics for one in wa.trace(scene, resolution=few, tolerance=tolerance)]

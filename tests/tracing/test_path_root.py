@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import root
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.model.kinematics import constraint_jacobian, constraints, tangential_jacobian
@@ -18,7 +19,7 @@ from wholearm_jax.tracing.path_root import path_derivatives, solve_on_path
 def flip():
     """The heptagon's second phase: its system, a place on its wire, the tangent there, and where the third contact's
     slip turns round."""
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     phase, path = scene.phases[1], wa.trace(scene)[1].path
     mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, phase.formation)
     near = path.nodes[int(path.first[1]) - 2, 0]
