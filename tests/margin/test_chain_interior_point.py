@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from reference.conic import ConicProgramme
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.margin import chain_interior_point, path_programme
@@ -22,7 +23,7 @@ ANY, REST = jnp.asarray(jnp.nan), jnp.asarray(0.0)
 @pytest.fixture(scope="module")
 def paths():
     """Tables of the bundled phases."""
-    scenes = {name: wa.load(name) for name in ("heptagon", "hexagon")}
+    scenes = {name: layered(name) for name in ("heptagon", "hexagon")}
     traced = {name: wa.trace(scene) for name, scene in scenes.items()}
     return {(name, k): at.dynamics for name, phases in traced.items() for k, at in enumerate(phases)}
 

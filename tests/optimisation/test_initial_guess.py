@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import layered
 
-import wholearm_jax as wa
 from wholearm_jax.margin import acceleration_terms
 from wholearm_jax.optimisation.constraints import linkage_defects
 from wholearm_jax.optimisation.coupled_phases import stack_dynamics
@@ -18,14 +18,14 @@ KNOTS, DURATION, FRACTION = 1001, 0.8, 0.9
 @pytest.fixture(scope="module", params=[0, 1])
 def single(request):
     """A phase of the heptagon and its guesses."""
-    dynamics = trace(wa.load("heptagon"))[request.param].dynamics
+    dynamics = trace(layered("heptagon"))[request.param].dynamics
     return dynamics, initial_guesses([dynamics], [DURATION], KNOTS, FRACTION)
 
 
 @pytest.fixture(scope="module")
 def coupled():
     """The phases of the flight, and their guesses."""
-    phase_dynamics = [traced.dynamics for traced in trace(wa.load("flight"))]
+    phase_dynamics = [traced.dynamics for traced in trace(layered("flight"))]
     durations = np.array([0.5, 0.7, 0.6])[: len(phase_dynamics)]
     return phase_dynamics, durations, initial_guesses(phase_dynamics, durations, KNOTS, FRACTION)
 
