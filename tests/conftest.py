@@ -20,7 +20,7 @@ def pytest_collection_modifyitems(items):
 
     def place(item):
         late = ("test_notebooks", "test_scene_toml")
-        derived = any(word in item.nodeid for word in ("gradient", "derivatives"))
+        derived = any(word in item.nodeid for word in ("gradient", "derivatives", "test_readme"))
         return -1 if derived else next((k for k, name in enumerate(late, 1) if name in item.nodeid), 0)
 
     items.sort(key=place)

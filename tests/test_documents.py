@@ -152,6 +152,13 @@ def test_old_names_of_the_root_lead_to_the_new_ones():
         _ = wa.wire
 
 
+def test_the_page_of_benchmarks_has_every_script():
+    table = (ROOT / "benchmarks" / "README.md").read_text().split("| script | compares |")[1].split("\n\n")[0]
+    named = re.findall(r"`([\w./]+)`", "".join(re.findall(r"^\|([^|]*)\|", table, re.MULTILINE)))
+    scripts = [path.name for path in (ROOT / "benchmarks").glob("*.py")]
+    assert sorted(named) == sorted([*scripts, "stability/"])
+
+
 def test_symbols_of_the_glossary_are_given_once():
     rows = re.findall(r"^\| ([^|]+) \|[^|]*\| `", (DOCS / "glossary.md").read_text(), re.MULTILINE)
     symbols = [row.strip() for row in rows if row.strip()]

@@ -424,6 +424,13 @@ def waiting(push, first, then):
     return wa.torque_schedule([0.0, 0.2, 0.2, 1.0, 1.0, 2.0], values)
 
 
+@eqx.filter_jit
+def graded(scene, torque):
+    """One scene's check in the coarse pass, torques that step: a program for all schedules."""
+    step = COARSE_PASS._replace(options=replace(COARSE_PASS.options, has_jumps=True))
+    return check_scene(scene, torque, ARRIVAL, step)
+
+
 @pytest.mark.parametrize("ways", [("squeeze", "squeeze"), ("open", "open"), ("squeeze", "open"), ("open", "squeeze")])
 def test_an_object_waits_only_where_some_forces_hold_it(scene, schedule, ways):
     """Fingers that open gently do not move the object as far as accelerations tell, but nothing holds it either."""
@@ -432,8 +439,7 @@ def test_an_object_waits_only_where_some_forces_hold_it(scene, schedule, ways):
     alone = wa.simulate(scene, torque, arrival=ARRIVAL)
     assert alone.phases[0].holds[0].start == 0.0, "it waits"
     assert (alone.phases[0].holds[0].loss_time is None) is held
-    step = COARSE_PASS._replace(options=replace(COARSE_PASS.options, has_jumps=True))
-    _, grade = jax.jit(lambda: check_scene(scene, pad_schedule(torque), ARRIVAL, step))()
+    _, grade = graded(scene, pad_schedule(torque))
     assert int(grade) == (NextPass.DONE if held else NextPass.SINGLE)
     assert_as_alone(wa.check([scene], torque, arrival=ARRIVAL, tolerance=1e-10), scene, torque, 0)
 
