@@ -16,6 +16,7 @@ RUNS = {  # what each runs, after `import NAME as module`
     "execution": "module.SCENES, module.STEPS = ('heptagon',), (1.6e-3, 8e-4); run('--quick')",
     "flying_plans": "run('--count', '1', '--phases', '2')",
     "gradients": "module.KNOTS, module.TOLERANCES = (4,), (1e-4,); run('--quick')",
+    "interruption": "run('--runs', '1', '--latest', '3')",
     "optimisation": "module.random_plans = lambda *_: (); run('--quick', '--knots', '8')",
     "prediction": "module.SORTS, module.TIMESTEP = {'stopping': 1}, 4e-4; run('--quick', '--seeds', '0')",
     "random_plans": "run('--count', '1', '--phases', '1')",
