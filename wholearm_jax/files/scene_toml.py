@@ -114,6 +114,7 @@ class _Object(_Strict):
     ]
     inertia: Positive | None = None
     center_of_mass: Pair | None = None
+    flush_tolerance: NonNegative | None = None
 
 
 class _Start(_Strict):
@@ -287,7 +288,7 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
             **{key: as_device_array([getattr(f, key) for f in fingers]) for key in _Finger.model_fields},
             layered=as_device_array(checked.hand.fingers == "layered"),
         ),
-        object=polygon(shape.vertices, shape.mass, each, shape.inertia, shape.center_of_mass),
+        object=polygon(shape.vertices, shape.mass, each, shape.inertia, shape.center_of_mass, shape.flush_tolerance),
         start=as_device_array([getattr(checked.start, c) for c in COORDINATES]),
         phases=tuple(
             Phase(
@@ -361,6 +362,8 @@ def to_dict(scene: Scene) -> dict[str, Any]:
         solid["inertia"] = float(shape.inertia)
     if shape.center_of_mass is not None:
         solid["center_of_mass"] = np.asarray(shape.center_of_mass).tolist()
+    if shape.flush_tolerance is not None:
+        solid["flush_tolerance"] = float(shape.flush_tolerance)
     return {
         "title": scene.title,
         "gravity": np.asarray(scene.gravity).tolist(),

@@ -24,7 +24,8 @@ class ScaledMechanics(eqx.Module):
     acceleration. `candidates` are all pairs that may touch, `exists` those of features that the object has;
     `may_terminate`
     marks those that could end the formation, `may_be_behind` vertices that may lie behind a link, whose back stops
-    them. `links` are the gaps among the links of `hand`.
+    them. `links` are the gaps among the links of `hand`. Vertices that begin less than `flush_tolerance` behind a link
+    lie flush on it.
     `length` [m] and `mass` [kg] are the units; `torque_limit` stays in N m.
     """
 
@@ -35,6 +36,7 @@ class ScaledMechanics(eqx.Module):
     may_be_behind: Bool[Array, "candidates"]
     links: LinkObstacles
     hand: Hand
+    flush_tolerance: Float[Array, ""]
     inertia: Float[Array, "5"]
     viscous: Float[Array, "2"]
     dry: Float[Array, "2"]
@@ -72,7 +74,14 @@ def scaled_mechanics(
     real = jnp.arange(body.vertices.shape[0]) < body.count
     length, mass = jnp.sqrt(jnp.where(real, (body.vertices**2).sum(1), 0.0).max()), body.mass
     rotary = mass * length**2
-    small_body = RigidBody(body.vertices / length, body.count, body.mass / mass, body.inertia / rotary, body.friction)
+    small_body = RigidBody(
+        vertices=body.vertices / length,
+        count=body.count,
+        mass=body.mass / mass,
+        inertia=body.inertia / rotary,
+        friction=body.friction,
+        flush_tolerance=body.flush_tolerance / length,
+    )
     small_hand = Hand(
         joint=hand.joint / length,
         length=hand.length / length,
@@ -92,10 +101,13 @@ def scaled_mechanics(
         contacts=contact_set(small_body, small_hand, formation),
         candidates=contact_set(small_body, small_hand, pairs),
         exists=touchable,
-        may_terminate=touchable & ~_coincides_with_contact(pairs, formation, body.count),
+        may_terminate=touchable
+        & ~_coincides_with_contact(pairs, formation, body.count)
+        & ~_lies_flush(pairs, formation, small_body),
         may_be_behind=_may_be_behind(pairs, formation, _is_convex(body)),
         links=link_obstacles(small_hand),
         hand=small_hand,
+        flush_tolerance=small_body.flush_tolerance,
         inertia=jnp.concatenate([heavy, small_hand.inertia]),
         viscous=small_hand.viscous,
         dry=small_hand.dry,
@@ -136,3 +148,19 @@ def _coincides_with_contact(pairs: ContactFormation, formation: ContactFormation
     there = jax.vmap(same)(pairs.link, jnp.zeros_like(pairs.kind), after).any(1)
     flush = (pairs.kind == EDGE) & here & there
     return member | flush
+
+
+def _lies_flush(pairs: ContactFormation, formation: ContactFormation, body: RigidBody) -> Bool[Array, "candidates"]:
+    """Vertices on the line through two that a link holds, to within the tolerance: their gap never changes."""
+
+    def on_link(link):
+        held = (formation.link == link) & (formation.kind == VERTEX) & ~formation.tangential
+        rows = held.shape[0]
+        one, other = formation.feature[jnp.argmax(held)], formation.feature[rows - 1 - jnp.argmax(held[::-1])]
+        begin, along = body.vertices[one], body.vertices[other] - body.vertices[one]
+        away = body.vertices - begin
+        across = jnp.abs(along[0] * away[:, 1] - along[1] * away[:, 0])
+        return jnp.any(held) & (one != other) & (across <= body.flush_tolerance * jnp.sqrt((along**2).sum()))
+
+    flush = jax.vmap(on_link)(jnp.arange(3))
+    return (pairs.kind == VERTEX) & flush[pairs.link, pairs.feature]

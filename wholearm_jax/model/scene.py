@@ -20,6 +20,7 @@ from wholearm_jax.core import as_device_array
 
 COORDINATES = ("x", "y", "phi", "theta1", "theta2")
 LINKS = ("palm", "finger1", "finger2")
+FLUSH_TOLERANCE = 1e-6  # [m]
 VERTEX, EDGE = 0, 1  # contact types: A, an object vertex on a link; B, a fingertip on an object edge
 _CONTACT_PATTERN = re.compile(r"(palm|finger1|finger2):([ve])([0-9]+)( rolling)?")
 
@@ -38,6 +39,7 @@ class Polygon(eqx.Module):
     `vertices` is padded to a multiple of eight rows, so that polygons of different size share one compiled program;
     `count` says how many rows are real. `friction` holds one coefficient for each link (palm, finger 1, finger 2).
     `inertia` [kg m^2] and `center_of_mass` [m] are None for a uniform density.
+    A vertex that begins within `flush_tolerance` [m] behind a link lies flush on it (None: `FLUSH_TOLERANCE`).
     """
 
     vertices: Float[Array, "capacity 2"]
@@ -46,6 +48,7 @@ class Polygon(eqx.Module):
     friction: Float[Array, "3"]
     inertia: Float[Array, ""] | None = None
     center_of_mass: Float[Array, "2"] | None = None
+    flush_tolerance: Float[Array, ""] | None = None
 
 
 class Hand(eqx.Module):
@@ -161,9 +164,10 @@ class RigidBody(eqx.Module):
     mass: Float[Array, ""]
     inertia: Float[Array, ""]
     friction: Float[Array, "3"]
+    flush_tolerance: Float[Array, ""]
 
 
-def polygon(vertices, mass, friction, inertia=None, center_of_mass=None) -> Polygon:
+def polygon(vertices, mass, friction, inertia=None, center_of_mass=None, flush_tolerance=None) -> Polygon:
     """Build a `Polygon` from `(n, 2)` vertices; `friction` is a number or one for each link."""
     given = np.asarray(vertices, float)
     padding = np.broadcast_to(given[-1], (-len(given) % 8, 2))
@@ -174,6 +178,7 @@ def polygon(vertices, mass, friction, inertia=None, center_of_mass=None) -> Poly
         friction=as_device_array(np.broadcast_to(np.asarray(friction, float), (3,))),
         inertia=None if inertia is None else as_device_array(inertia, float),
         center_of_mass=None if center_of_mass is None else as_device_array(center_of_mass, float),
+        flush_tolerance=None if flush_tolerance is None else as_device_array(flush_tolerance, float),
     )
 
 
@@ -251,6 +256,9 @@ def rigid_body(shape: Polygon) -> RigidBody:
         mass=shape.mass,
         inertia=own if shape.inertia is None else shape.inertia,
         friction=shape.friction,
+        flush_tolerance=jnp.full_like(shape.mass, FLUSH_TOLERANCE)
+        if shape.flush_tolerance is None
+        else shape.flush_tolerance,
     )
 
 

@@ -65,7 +65,7 @@ def trace_phase_path(
     mechanics: ScaledMechanics, initial_guess, target: PathTarget, resolution: Resolution, first, holds
 ) -> tuple[ContactPath, Float[Array, "5"], Float[Array, "5"]]:
     """Trace the path of a phase, and return it with `z` (SI) at its start and end; see `trace_phase`."""
-    path = trace_path(mechanics, initial_guess, target, resolution)
+    path = trace_path(mechanics, initial_guess, target, resolution, may_settle=first)
     begin, end = (z * mechanics.configuration_unit for z in (path.start, path.end))
     offset, is_traced = jnp.abs(begin - initial_guess).max(), path.status == int(Status.OK)
     detached = is_traced & ~jnp.asarray(first) & ~(offset < max(CONTINUITY, eps_power(offset, 5 / 8)))

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from wholearm_jax.core import eps_power
 from wholearm_jax.model import (
     Carrier,
     ContactSet,
@@ -95,12 +96,17 @@ def event_functions(mechanics: ScaledMechanics, target: PathTarget, z: Float[Arr
     """Gather the terminal events of a formation's path from `z` on."""
     pairs, held, links = mechanics.candidates, mechanics.contacts, mechanics.links
     until = target.until_coordinate >= 0
+    # A vertex that begins flush on a link, a little behind it, may stay as deep as it is.
+    depth = -contact_kinematics(pairs, z).gap
+    is_flush = (depth > eps_power(z, 5 / 8)) & (depth <= mechanics.flush_tolerance) & pairs.on_link
+    flush_depth = jnp.where(is_flush & ~mechanics.may_be_behind, depth, 0.0)
     sense = jnp.where(target.until_value < z[target.until_coordinate], -1.0, 1.0)
+    of_target = jnp.where(until, sense * target.until_value, 1.0)
     one, none, far = jnp.ones_like(held.lower), jnp.zeros_like(held.lower), jnp.full_like(held.lower, jnp.inf)
     every, nothing, of_links = jnp.ones_like(pairs.lower), jnp.zeros_like(pairs.lower), jnp.zeros_like(links.gap)
 
-    def rows(of_pairs, before, behind, of_target, of_links):
-        return jnp.concatenate([of_pairs, before, behind, jnp.reshape(of_target, 1), of_links])
+    def rows(of_pairs, before, behind, of_coordinate, of_links):
+        return jnp.concatenate([of_pairs, before, behind, jnp.reshape(of_coordinate, 1), of_links])
 
     contacts = jax.tree.map(
         lambda a, b, c: rows(a, b, b, b[0], c),
@@ -112,7 +118,7 @@ def event_functions(mechanics: ScaledMechanics, target: PathTarget, z: Float[Arr
         along=rows(nothing, one, -one, 0.0, of_links),
         coordinate_weight=rows(nothing, none, none, jnp.where(until, -sense, 0.0), of_links),
         joint_angle=tuple(rows(nothing, none, none, 0.0, weight) for weight in links.joint_angle),
-        shift=rows(nothing, -held.lower, held.upper, jnp.where(until, sense * target.until_value, 1.0), links.shift),
+        shift=rows(flush_depth, -held.lower, held.upper, of_target, links.shift),
         coordinate=target.until_coordinate,
         lower=rows(pairs.lower, -far, -far, -jnp.inf, links.contacts.lower),
         upper=rows(pairs.upper, far, far, jnp.inf, links.contacts.upper),

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core import eps_power, fused_matmul, solve
-from wholearm_jax.model import PathTarget, ScaledMechanics, constraint_jacobian, constraints
+from wholearm_jax.core import eps_power, fused_matmul, solve, take_row
+from wholearm_jax.model import PathTarget, ScaledMechanics, constraint_jacobian, constraints, contact_kinematics
 from wholearm_jax.tracing.curve import oriented_tangent
 from wholearm_jax.tracing.path_root import solve_on_path
 
+MAX_SETTLING_DEPTH = 0.02  # [object radii]
 MAX_PROJECTION_STEP, PROJECTION_ITERATIONS = 0.3, 12  # of the least-norm Newton iterations [radii or radians]
 
 
@@ -46,6 +47,44 @@ def project_onto_path(mechanics: ScaledMechanics, initial_guess: Float[Array, "5
     fixed_nearest = stop_gradient(nearest)
     tangent, _ = oriented_tangent(fixed, fixed_nearest, stop_gradient(root.x))
     return nearest, jnp.abs(constraints(fixed.contacts, fixed_nearest)).max(), tangent
+
+
+def settle_on_link(
+    mechanics: ScaledMechanics, start: Float[Array, "5"], tangent: Float[Array, "5"]
+) -> tuple[Float[Array, "5"], Float[Array, "5"]]:
+    """Move a start at which a vertex lies a little behind a link along the path until it touches.
+
+    A rough start that is meant flat, with a side on a link, is projected to either side of the flat pose.
+
+    Args:
+        mechanics: the formation in object units.
+        start: a configuration on the path (5,).
+        tangent: the unit tangent there (5,).
+
+    Returns:
+        The configuration and tangent; as given where no vertex is between the tolerance for flush ones and
+        `MAX_SETTLING_DEPTH` behind a link, or where the path does not lead to the link.
+    """
+    fixed, fixed_start = stop_gradient((mechanics, start))
+    pairs, at = fixed.candidates, contact_kinematics(fixed.candidates, fixed_start)
+    may_settle = fixed.may_terminate & pairs.on_link & ~fixed.may_be_behind
+    inside = (at.along > pairs.lower) & (at.along < pairs.upper)
+    depth = jnp.where(may_settle & inside, -at.gap, 0.0)
+    row, deepest = jnp.argmax(depth), depth.max()
+
+    def gap(mechanics, z, x):
+        return contact_kinematics(jax.tree.map(lambda a: take_row(a, row), mechanics.candidates), z).gap
+
+    def settle():
+        root = solve_on_path(gap, mechanics, start, stop_gradient(tangent))
+        size = jnp.sqrt((root.x**2).sum())
+        is_found = root.residual < eps_power(root.z, 1 / 2)
+        return jnp.where(is_found, root.z, start), jnp.where(is_found, stop_gradient(root.x / size), tangent)
+
+    lies_behind = (deepest > jnp.maximum(fixed.flush_tolerance, eps_power(start, 5 / 8))) & (
+        deepest < MAX_SETTLING_DEPTH
+    )
+    return jax.lax.cond(lies_behind, settle, lambda: (start, tangent))
 
 
 def orient_tangent(tangent: Float[Array, "5"], target: PathTarget) -> Float[Array, "5"]:

@@ -30,6 +30,7 @@ def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) ->
     vertices may lie.
     """
     tolerance = eps_power(z, 5 / 8)
+    flush_tolerance = jnp.maximum(tolerance, mechanics.flush_tolerance)
     contacts, pairs = contact_kinematics(mechanics.contacts, z), contact_kinematics(mechanics.candidates, z)
     beyond = (contacts.along < mechanics.contacts.lower - tolerance) | (
         contacts.along > mechanics.contacts.upper + tolerance
@@ -40,9 +41,9 @@ def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) ->
         & mechanics.candidates.on_link
         & ~mechanics.may_be_behind
         & inside
-        & (pairs.gap < -tolerance)
+        & (pairs.gap < -flush_tolerance)
     )
-    return jnp.any(beyond) | jnp.any(behind) | link_penetrates_object(mechanics, pairs, tolerance)
+    return jnp.any(beyond) | jnp.any(behind) | link_penetrates_object(mechanics, pairs, flush_tolerance)
 
 
 def links_overlap(mechanics: ScaledMechanics, z: Float[Array, "5"]) -> Bool[Array, ""]:

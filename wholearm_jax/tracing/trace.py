@@ -17,7 +17,7 @@ Derivation: section 3 of `docs/derivation.md`.
 import equinox as eqx
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import Status, eps_power
 from wholearm_jax.model import PathTarget, ScaledMechanics, anchor_rolling
@@ -27,13 +27,17 @@ from wholearm_jax.tracing.event_location import locate_events
 from wholearm_jax.tracing.events import event_functions
 from wholearm_jax.tracing.nodes import solve_nodes
 from wholearm_jax.tracing.path import ContactPath, PathEnd, Resolution
-from wholearm_jax.tracing.projection import dominant_coordinate, orient_tangent, project_onto_path
+from wholearm_jax.tracing.projection import dominant_coordinate, orient_tangent, project_onto_path, settle_on_link
 from wholearm_jax.tracing.segments import distribute_panels, segment_signs, split_into_segments
 from wholearm_jax.tracing.start_checks import is_rank_deficient, links_overlap, violates_contact_limits
 
 
 def trace_path(
-    mechanics: ScaledMechanics, initial_guess: Float[Array, "5"], target: PathTarget, resolution: Resolution
+    mechanics: ScaledMechanics,
+    initial_guess: Float[Array, "5"],
+    target: PathTarget,
+    resolution: Resolution,
+    may_settle: bool | Bool[Array, ""] = True,
 ) -> ContactPath:
     """Project an initial guess onto the path of a formation and follow the path to its end.
 
@@ -42,6 +46,7 @@ def trace_path(
         initial_guess: `z` in SI units (5,).
         target: the direction of travel, and where to stop before the formation ends (SI).
         resolution: array sizes.
+        may_settle: whether the start may be moved to where a vertex a little behind a link touches (`settle_on_link`).
 
     Returns:
         The path. Nothing is raised: `status` is `no_convergence` (the contacts cannot all touch near the start, or an
@@ -59,6 +64,8 @@ def trace_path(
 
     # Project, follow the curve, locate its end and kinks.
     start, residual, tangent = project_onto_path(mechanics, initial_guess)
+    settled = settle_on_link(mechanics, start, tangent)
+    start, tangent = (jnp.where(may_settle, a, b) for a, b in zip(settled, (start, tangent), strict=True))
     tangent = orient_tangent(tangent, fixed_target)
     events = event_functions(mechanics, target, stop_gradient(start))
     fixed_start, fixed_events = stop_gradient((start, events))
