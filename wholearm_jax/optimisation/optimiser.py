@@ -55,7 +55,7 @@ from wholearm_jax.optimisation.coupled_phases import (
 )
 from wholearm_jax.optimisation.plan_transitions import holding_schedule, rest_transitions
 from wholearm_jax.optimisation.precompilation import precompile_optimise, schedule_rows
-from wholearm_jax.optimisation.quasistatic_plan import bounds, require_knots
+from wholearm_jax.optimisation.quasistatic_plan import bounds, explain_negative_bounds, require_knots
 from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.optimisation.solver import IterationRecord
 from wholearm_jax.phases import Result, TracedPhase, build_result, simulate_phases, trace
@@ -183,7 +183,7 @@ def _solve_plan(
     phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, durations, strict=True))
     scene, torque = eqx.tree_at(lambda s: s.phases, scene, phases), concatenate_schedules(schedules)
     simulated = simulate_phases(scene, torque, traced, with_step_capacity(IntegratorOptions(), options.knots))
-    result = build_result(scene, torque, traced, simulated)
+    result = explain_negative_bounds(build_result(scene, torque, traced, simulated), margin_bounds, traced)
     return OptimisationResult(scene, torque, result, margin_bounds, tuple(stopped), tuple(history))
 
 

@@ -3,7 +3,13 @@
 from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, IMPULSE_ROUNDING, assess_phase
 from wholearm_jax.phases.compressive_margin import margin
 from wholearm_jax.phases.gradients import check_gradient
-from wholearm_jax.phases.phase_ends import describe_end, final_configuration, statics_at_start, target_configuration
+from wholearm_jax.phases.phase_ends import (
+    configuration,
+    describe_end,
+    final_configuration,
+    statics_at_start,
+    target_configuration,
+)
 from wholearm_jax.phases.phase_simulation import SimulatedPhase, precompile_simulation, simulate_phase
 from wholearm_jax.phases.phase_tracing import TracedPhase, trace_phase
 from wholearm_jax.phases.plan_schedule import (
@@ -23,5 +29,5 @@ from wholearm_jax.phases.plan_simulation import (
 )
 from wholearm_jax.phases.plan_tracing import trace, trace_paths_in_one_program
 from wholearm_jax.phases.rest_certificate import certify_rest
-from wholearm_jax.phases.result import Result, build_result, rest_intervals
+from wholearm_jax.phases.result import PhaseResult, Result, build_result, rest_intervals
 from wholearm_jax.phases.sampling import DEFAULT_SAMPLES, sample_phase, trajectory

@@ -17,6 +17,8 @@ from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.phase_tracing import TracedPhase
 
 SLIP_TOL = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
+REFUSED_STARTS = (Status.LEFT_FORMATION, Status.OBSTACLE)  # statuses of a path that mean that it cannot begin
+REMEDY_START = "the path cannot begin there: correct the start's pose and angles, or choose other contacts or fingers"
 MIN_REST = 1e-9  # share of a phase: an object that comes to rest at its end does so earlier or later by rounding
 
 
@@ -25,7 +27,8 @@ class PhaseResult:
     """A simulated phase, readable: times in seconds from the plan's start, contacts by name, forces in newtons.
 
     `time` is when the phase ended or failed. A phase that is entered while moving begins at `start` with `impulses`
-    [N s], one a contact. `detail` names what is in the way where the phase cannot begin, or ends at an obstacle.
+    [N s], one a contact. `detail` names what is in the way where the phase cannot begin, ends at an
+    obstacle or cannot be held by any torque, and `remedy` what helps then.
     `slip_velocity` says that the contact lost is one that should roll, and that it leaves its friction cone.
     `margin` is the least force while the object moves; while friction holds it at rest forces are not determined, and
     `best_quasistatic_torque_batch` says what the contacts can do. A phase that only holds has the margin of its hold.
@@ -49,6 +52,7 @@ class PhaseResult:
     traced: TracedPhase
     outcome: SimulatedPhase
     detail: str | None = None
+    remedy: str | None = None
 
     @property
     def message(self) -> str:
@@ -57,7 +61,8 @@ class PhaseResult:
             return f"{self.name}: ok, margin {self.margin:.4g} N at {self.margin_contact}, t = {self.margin_time:.4g} s"
         whose = f" at {self.contact}" if self.contact else ""
         advice = SLIP_TOL if self.slips else self.status.advice
-        advice = f"{self.detail}; {advice}" if self.detail else advice
+        if self.detail:
+            advice = f"{self.detail}; {self.remedy or advice}"
         rests = self.status is Status.STUCK and self.holds
         since = f", at rest since {self.holds[-1].start:.6g} s" if rests else ""
         return f"{self.name}: {self.status.label}{whose}, t = {self.time:.6g} s{since}: {advice}"
@@ -127,6 +132,7 @@ def build_result(scene: Scene, torque: TorqueSchedule, traced, found) -> Result:
             traced=at,
             outcome=outcome,
             detail=_detail(scene, phase, at, Status(int(assessment.status))),
+            remedy=REMEDY_START if int(at.path.status) in REFUSED_STARTS else None,
         )
         rows.append(_with_holds(one))
     return Result(scene, torque, tuple(rows))
@@ -134,8 +140,7 @@ def build_result(scene: Scene, torque: TorqueSchedule, traced, found) -> Result:
 
 def _detail(scene: Scene, phase: Phase, traced: TracedPhase, status: Status) -> str | None:
     """Name what is in the way of a phase."""
-    refused = int(traced.path.status)
-    if refused in (Status.LEFT_FORMATION, Status.OBSTACLE):
+    if int(traced.path.status) in REFUSED_STARTS:
         return describe_refused_start(scene, phase, traced.begin)
     return describe_end(scene, phase, traced) if status is Status.OBSTACLE else None
 
