@@ -6,7 +6,15 @@ from typing import Annotated, Any
 
 import typer
 
-from wholearm_jax.cli.arguments import AsJson, BadInput, SceneName, make_output_folder, phase_number, refuse_unwritable
+from wholearm_jax.cli.arguments import (
+    AsJson,
+    BadInput,
+    SceneName,
+    make_output_folder,
+    note,
+    phase_number,
+    refuse_unwritable,
+)
 from wholearm_jax.cli.prediction import trace_or_exit
 from wholearm_jax.cli.tables import Column, print_json, print_table
 
@@ -33,7 +41,8 @@ def formations(
     The configuration is the end of a phase, or the start; in a scene without phases, what can begin near its start.
     """
     from wholearm_jax.files import load_start
-    from wholearm_jax.planning import successor_formations, touching_contacts
+    from wholearm_jax.phases import describe_overlaps
+    from wholearm_jax.planning import flush_sides, successor_formations, touching_contacts
 
     loaded = load_start(scene)
     folder = make_output_folder(out)
@@ -44,13 +53,19 @@ def formations(
     else:
         z, touching, title = loaded.start, touching_contacts(loaded, loaded.start, NEAR_TOL), "touching, or near"
         successors = successor_formations(loaded, z, rolling=True, touching=touching)
+    flush, overlaps = flush_sides(loaded, touching), describe_overlaps(loaded, z)
+    for overlap in overlaps:
+        note(f"{scene}: {overlap}: no phase can begin here")
     if as_json:
-        print_json({"touching": touching, "formations": [_json_row(successor) for successor in successors]})
+        rows = [_json_row(successor) for successor in successors]
+        print_json({"touching": touching, "flush": flush, "overlaps": overlaps, "formations": rows})
     else:
         begins = () if loaded.phases else (BEGIN_COLUMN,)
         columns = [*map(Column, TEXT_COLUMNS), *(Column(name, True) for name in (*begins, *NUMBER_COLUMNS))]
         rows = [_table_row(successor, bool(begins)) for successor in successors]
-        print_table(columns, rows, f"{title}: {', '.join(touching) or 'nothing'}", LEGEND)
+        lines = [f"{title}: {', '.join(touching) or 'nothing'}"]
+        lines += [f"flush: {', '.join(flush)} (a formation holds one of its vertices, or both)"] if flush else []
+        print_table(columns, rows, "\n".join(lines), LEGEND)
     if folder is not None:
         from wholearm_jax.files import FileSet, replace_files
         from wholearm_jax.plotting import plot_successors, save_figure

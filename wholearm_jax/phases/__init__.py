@@ -3,6 +3,7 @@
 from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, IMPULSE_ROUNDING, assess_phase
 from wholearm_jax.phases.compressive_margin import margin
 from wholearm_jax.phases.gradients import check_gradient
+from wholearm_jax.phases.obstacles import describe_overlaps
 from wholearm_jax.phases.phase_ends import (
     configuration,
     describe_end,

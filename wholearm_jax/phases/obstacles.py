@@ -57,7 +57,7 @@ def describe_overlaps(scene: Scene, z: Float[Array, "5"], tolerance: float = 1e-
     Args:
         scene: the hand and the object.
         z: a configuration (5,).
-        tolerance: a smaller depth is none, in the object's radius (links: radii or radians).
+        tolerance: a smaller depth is none, in the object's radius or radians; in the object, also one that is flush.
 
     Returns:
         A line for each pair, the links among themselves first; empty where nothing overlaps.
@@ -73,7 +73,8 @@ def describe_overlaps(scene: Scene, z: Float[Array, "5"], tolerance: float = 1e-
     for k, angle in enumerate((beyond1, beyond2)):
         if angle > tolerance:
             lines.append(f"finger{k + 1} is {np.degrees(angle):.3g} deg beyond its range")
-    return (*lines, *_object_overlaps(scene, z, tolerance * radius))
+    flush_tolerance = float(rigid_body(scene.object).flush_tolerance)
+    return (*lines, *_object_overlaps(scene, z, max(tolerance * radius, flush_tolerance)))
 
 
 _overlaps = jax.jit(link_overlaps)
@@ -107,13 +108,13 @@ def _object_overlaps(scene: Scene, z, tolerance: float) -> list[str]:
         line = _link_in_object(link, gap[link], along[link], lower[link, 0], upper[link, 0])
         if line is not None and line[0] > tolerance:
             depth, feature = line
-            name = "the palm" if link == 0 else LINKS[link]
-            verb = (
-                f"object lies {1e3 * depth:.3g} mm below the palm"
+            size = f"{1e3 * depth:.3g} mm"
+            where = (
+                f"the object lies {size} below the palm"
                 if link == 0
-                else (f"{name} lies {1e3 * depth:.3g} mm inside the object")
+                else f"{LINKS[link]} lies {size} inside the object"
             )
-            lines.append(f"{verb} at {feature}")
+            lines.append(f"{where} at {feature}")
     return lines
 
 

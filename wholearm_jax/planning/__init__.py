@@ -1,10 +1,17 @@
 """Which contact formation can come next."""
 
-from wholearm_jax.planning.successors import Successor, exit_velocity, successor_formations, touching_contacts
+from wholearm_jax.planning.successors import (
+    Successor,
+    exit_velocity,
+    flush_sides,
+    successor_formations,
+    touching_contacts,
+)
 
 __all__ = [
     "Successor",
     "exit_velocity",
+    "flush_sides",
     "successor_formations",
     "touching_contacts",
 ]

@@ -20,6 +20,7 @@ from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel, resolve_
 from wholearm_jax.margin import MAX_ROLLING, MarginBound, best_quasistatic_torque, margin_upper_bound
 from wholearm_jax.model import (
     COORDINATES,
+    LINKS,
     Phase,
     Scene,
     constraint_jacobian,
@@ -84,6 +85,21 @@ def touching_contacts(scene: Scene, z: Float[Array, "5"], tolerance: float = CON
     near = np.asarray(_near(scene, z, pairs, tolerance))
     rows = zip(*(np.asarray(a)[near] for a in (pairs.link, pairs.kind, pairs.feature)), strict=True)
     return tuple(contact_name(*(int(v) for v in row)) for row in rows)
+
+
+def flush_sides(scene: Scene, touching: Sequence[str]) -> tuple[str, ...]:
+    """Name the sides of the object that lie flush on a link: both ends of an edge touch it.
+
+    Args:
+        scene: the object.
+        touching: names of contacts, as `touching_contacts` returns them.
+
+    Returns:
+        Lines such as `e5 on palm`. A formation holds one of the two vertices, or both.
+    """
+    count, names = int(scene.object.count), {*touching}
+    pairs = [(link, k) for link in LINKS for k in range(count)]
+    return tuple(f"e{k} on {link}" for link, k in pairs if {f"{link}:v{k}", f"{link}:v{(k + 1) % count}"} <= names)
 
 
 @eqx.filter_jit

@@ -6,11 +6,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Polygon as Patch
+from shapely import LineString
+from shapely import Polygon as ShapelyPolygon
 
 from wholearm_jax.model import Scene, rigid_body
-from wholearm_jax.phases import Result, trajectory
+from wholearm_jax.phases import Result, describe_overlaps, trajectory
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
-from wholearm_jax.plotting.style import FILL, INK, PAGE, PALE
+from wholearm_jax.plotting.style import ALARM, FILL, INK, PAGE, PALE
 
 
 def plot_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbers: bool = False) -> Axes:
@@ -21,12 +23,15 @@ def plot_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbe
     joints, lengths, offsets = (np.asarray(a) for a in (scene.hand.joint, scene.hand.length, scene.hand.offset))
     ax.plot(joints[::-1, 0], [0, 0], color=INK, lw=2.5, solid_capstyle="butt")
     ax.add_patch(Patch(outline, closed=True, facecolor=FILL, edgecolor=INK, lw=1.0, joinstyle="round"))
+    segments = []
     for k, (joint, side) in enumerate(zip(joints, (1, -1), strict=True)):
         direction = np.array([np.cos(z[3 + k]), np.sin(z[3 + k])])
         base = joint + offsets[k] * side * np.array([-direction[1], direction[0]])
         ends = np.stack([base, base + lengths[k] * direction])
+        segments.append(ends)
         ax.plot(*ends.T, color=COLOURS[k], lw=2.5, solid_capstyle="round")
         ax.plot(*joint, "o", color=COLOURS[k], ms=4)
+    _mark_overlaps(scene, z, outline, segments, ax)
     ax.plot(z[0], z[1], "+", color=INK, ms=5)
     if numbers:
         inward = z[:2] - outline
@@ -60,12 +65,33 @@ def plot_strip(result: Result, poses: int = 4, axes=None) -> np.ndarray:
     return axes
 
 
+def _mark_overlaps(scene: Scene, z, outline, segments, ax: Axes) -> None:
+    """Mark where links lie in one another or in the object, with the pair and the depth in words."""
+    lines = describe_overlaps(scene, z)
+    if not lines:
+        return
+    first, second = (LineString(ends) for ends in segments)
+    inside = ShapelyPolygon(outline).buffer(-1e-9 * np.ptp(outline))
+    for part in (first.intersection(inside), second.intersection(inside)):
+        if part.length > 0:
+            ax.plot(*np.asarray(part.coords).T, color=ALARM, lw=4, zorder=5)
+    crossing = first.intersection(second)
+    if crossing.geom_type == "Point" and not bool(scene.hand.layered):
+        ax.plot(crossing.x, crossing.y, "x", color=ALARM, ms=9, mew=2, zorder=6)
+    at = {"transform": ax.transAxes, "ha": "center", "va": "top", "fontsize": "x-small", "color": ALARM}
+    ax.text(0.5, 0.0, "\n".join(lines), **at)
+
+
 def plot_successors(scene: Scene, z, successors, columns: int = 4, axes=None) -> np.ndarray:
     """The end of each phase that can follow configuration `z`, with the start in grey.
 
     Shows the `successors` whose path could be traced. Takes and returns an array of axes, at least one for each.
     """
     shown = [s for s in successors if s.status.value == 0]
+    if not shown:  # the configuration itself, with what is in the way
+        axes = pose_grid(axes, 1, 1, 1.15)
+        plot_pose(scene, z, axes.flat[0], label="nothing can begin here", numbers=True)
+        return axes
     axes = pose_grid(axes, max(1, -(-len(shown) // columns)), columns, 1.15)
     for ax in axes.flat:
         ax.axis("off")

@@ -40,6 +40,7 @@ PAPER: dict[Any, Any] = {
 Figures are then `COLUMN` or `PAGE` inches wide, with letters of 7 and 8 points."""
 
 INK, FILL, PALE = "#222222", "#E8EEF4", "#999999"
+ALARM = "#CC0000"  # what cannot be
 
 
 def save_figure(draw: Callable[[], Any], folder: Path, name: str) -> None:
