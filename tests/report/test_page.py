@@ -79,6 +79,23 @@ def test_page_holds_everything_it_needs(folder):
         assert phase["margin_contact"] in page
 
 
+def test_where_each_phase_begins_and_ends(folder):
+    """In millimetres and degrees, as the rows of the trajectory say."""
+    page = (folder / "report.html").read_text()
+    table = re.search(r'<table id="poses">.*?</table>', page, re.DOTALL)
+    assert table is not None
+    shown = [re.findall(r"<t[dh][^>]*>([^<]*)</t[dh]>", row) for row in re.findall(r"<tr><th scope.*?</tr>", table[0])]
+    rows = [row.split(",") for row in (folder / "trajectory.csv").read_text().splitlines()[1:]]
+    assert [cells[0] for cells in shown] == ["near", "far"]
+    for name, begin, begin_angle, end, end_angle, displacement, turn in shown:
+        own = np.array([[float(v) for v in row[2:5]] for row in rows if row[1] == name])
+        first, last = own[0], own[-1]
+        for text, position in ((begin, first), (end, last), (displacement, last - first)):
+            np.testing.assert_allclose([float(v) for v in text.split(",")], 1e3 * position[:2], atol=0.051)
+        for text, angle in ((begin_angle, first[2]), (end_angle, last[2]), (turn, last[2] - first[2])):
+            assert float(text) == pytest.approx(np.degrees(angle), abs=0.051)
+
+
 def test_a_plan_without_motion(folder):
     written = load_result_folder(folder)
     failed = written.summary | {"status": "singular", "margin": None, "message": "near: singular"}
@@ -271,6 +288,33 @@ def test_fits_its_window(width, opened):
     assert page.locator("h1").inner_text().lower() == TITLE.lower()
     size = page.locator("#play").bounding_box()
     assert min(size["width"], size["height"]) >= 44  # a finger's breadth
+
+
+def test_a_phone_shows_animation_plots_and_speed_together(opened):
+    page = opened(390)
+    bottom = {}
+    for name in ("#scene", "#play", "#time", "#rate", "#torques", "#forces"):
+        box = page.locator(name).bounding_box()
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= 390
+        bottom[name] = box["y"] + box["height"]
+    assert bottom["#rate"] < 400, "the speed is above the fold, in one line with the other controls"
+    assert max(bottom.values()) <= 800, "animation and plots are on one screen"
+    page.evaluate("window.scrollTo(0, 250)")
+    scene, forces = (page.locator(name).bounding_box() for name in ("#scene", "#forces"))
+    assert scene["y"] >= 0, "the animation stays in sight"
+    assert scene["y"] + scene["height"] < forces["y"] + forces["height"] < 800
+
+
+def test_wide_tables_scroll_within_themselves(opened):
+    page = opened(390)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    for name in ("#phases", "#poses"):
+        widths = page.locator(name).evaluate("(t) => [t.parentElement.clientWidth, t.parentElement.scrollWidth]")
+        assert widths[0] < widths[1], name
+        page.locator(name).evaluate("(t) => { t.parentElement.scrollLeft = 200; }")
+        head = page.locator(f"{name} tbody th").first.bounding_box()
+        assert 0 <= head["x"] < 40, "the phase's name stays in sight"
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -1,8 +1,8 @@
-"""Keep: results of checks in a Zarr (version 3) store, one chunk of scenes after the other.
+"""Results of checks in a Zarr (version 3) store, one chunk of scenes after the other.
 
-A chunk of every array is one file, written whole by one process; the chunk's entry in `done` is written last. Whoever
-is stopped, at any moment, leaves a store that can be read, and whoever opens it again goes on with the chunks that are
-not done. The store says what it is of (`store_metadata`): another scene, schedule, seed, setting or version is refused.
+A chunk of every array is one file, written whole by one process; the chunk's entry in `done` is written last. A process
+that is stopped, at any moment, leaves a store that can be read; opened again, it continues with the chunks that are not
+done. The store is identified (`store_metadata`): another scene, schedule, seed, setting or version is refused.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ TYPES = {"status": "int8", "margin": "float64", "time": "float64", "contact": "i
 
 
 def fingerprint(*trees: Any) -> str:
-    """A digest of every number, name and structure in pytrees."""
+    """Return a digest of every number, name and structure in pytrees."""
     digest = hashlib.sha256()
     for tree in trees:
         leaves, structure = jax.tree.flatten(tree)
@@ -45,25 +45,25 @@ class Store:
 
     @property
     def chunks(self) -> int:
-        """How many chunks there are."""
+        """The number of chunks."""
         return -(-self.count // self.chunk)
 
     def done(self) -> np.ndarray:
-        """Which chunks are complete."""
+        """Return which chunks are complete."""
         return np.asarray(self.array("done")[:]).astype(bool)
 
     def array(self, name: str) -> zarr.Array:
-        """One of the arrays, on disk."""
+        """Return one of the arrays, on disk."""
         array = self.group[name]
         assert isinstance(array, zarr.Array)
         return array
 
     def rows(self, number: int) -> slice:
-        """The rows of a chunk."""
+        """Return the rows of a chunk."""
         return slice(number * self.chunk, min(self.count, (number + 1) * self.chunk))
 
     def write(self, number: int, values: Mapping[str, np.ndarray]) -> None:
-        """Write a chunk of every array, and then that it is done."""
+        """Write a chunk of every array, then mark it as done."""
         try:
             for name, column in values.items():
                 array = self.array(name)
@@ -73,40 +73,40 @@ class Store:
             raise StoreError(f"{self.path}: cannot be written: {error.strerror or error}") from None
 
     def read(self, number: int) -> BatchResult:
-        """A chunk's results."""
+        """Return a chunk's results."""
         return BatchResult(*(np.asarray(self.array(name)[self.rows(number)]) for name in BatchResult._fields))
 
 
 def store_metadata(count: int, chunk: int, **settings: Any) -> dict[str, Any]:
-    """What a store is of: numbers and settings that JSON can hold, and the package's version."""
+    """Return what identifies a store: its scenes, settings and the package's version, as JSON can hold them."""
     whole = {"kind": KIND, "version": version("wholearm_jax"), "jax": version("jax"), "count": count, "chunk": chunk}
     return json.loads(json.dumps(whole | settings))
 
 
-def open_store(path: Path, wanted: Mapping[str, Any], torques: int = 0) -> Store:
-    """Open a store to go on with, or make it. Raises `StoreError` for a path that holds something else."""
+def open_store(path: Path, metadata: Mapping[str, Any], torques: int = 0) -> Store:
+    """Open a store to continue, or make it. Raises `StoreError` for a path that holds something else."""
     try:
         group = zarr.open_group(str(path), mode="r+")
     except (FileNotFoundError, GroupNotFoundError):
-        return _create_store(path, wanted, torques)
+        return _create_store(path, metadata, torques)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path}: not a store: {error}") from None
-    held = dict(group.attrs).get("identity")
-    if held is None and not group.attrs and {*group.keys()} <= {*TYPES, "torque", "done"}:
-        return _create_store(path, wanted, torques, again=True)
-    if not isinstance(held, Mapping) or held.get("kind") != KIND:
+    stored = dict(group.attrs).get("identity")
+    if stored is None and not group.attrs and {*group.keys()} <= {*TYPES, "torque", "done"}:
+        return _create_store(path, metadata, torques, again=True)
+    if not isinstance(stored, Mapping) or stored.get("kind") != KIND:
         raise StoreError(f"{path}: holds something else than a check")
-    other = sorted(key for key in {*held, *wanted} if held.get(key) != wanted.get(key))
+    other = sorted(key for key in {*stored, *metadata} if stored.get(key) != metadata.get(key))
     if other:
         raise StoreError(f"{path}: is of another {', '.join(other)}; give another --out, or the same command")
-    return Store(path, group, int(wanted["count"]), int(wanted["chunk"]))
+    return Store(path, group, int(metadata["count"]), int(metadata["chunk"]))
 
 
-def _create_store(path: Path, wanted: Mapping[str, Any], torques: int, again: bool = False) -> Store:
-    """A new store. What it is of is written last, so that one that was left half made is made `again`."""
+def _create_store(path: Path, metadata: Mapping[str, Any], torques: int, again: bool = False) -> Store:
+    """Make a store. Its metadata is written last, so that a store that was left half made is made `again`."""
     if not again and path.exists() and (not path.is_dir() or any(p.suffix != ".partial" for p in path.iterdir())):
         raise StoreError(f"{path}: exists and is not a store")
-    count, chunk = int(wanted["count"]), int(wanted["chunk"])
+    count, chunk = int(metadata["count"]), int(metadata["chunk"])
     try:
         group = zarr.create_group(str(path), overwrite=True)
         for name, kind in TYPES.items():
@@ -115,13 +115,13 @@ def _create_store(path: Path, wanted: Mapping[str, Any], torques: int, again: bo
         if torques:
             _add_array(group, "torque", "float64", np.nan, (count, torques, 3), chunk)
         _add_array(group, "done", "uint8", 0, (-(-count // chunk),), 1)
-        group.attrs["identity"] = dict(wanted)
+        group.attrs["identity"] = dict(metadata)
     except OSError as error:
         raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from None
     return Store(path, group, count, chunk)
 
 
 def _add_array(group: zarr.Group, name: str, kind: str, fill, shape: tuple[int, ...], chunk: int) -> None:
-    """An array cut into chunks along its first axis."""
+    """Add an array, cut into chunks along its first axis."""
     chunks = (min(chunk, shape[0]), *shape[1:])
     group.create_array(name, shape=shape, chunks=chunks, dtype=kind, fill_value=fill)

@@ -5,6 +5,7 @@ A page is made from the files that `files.results` writes, and so at any time la
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from jinja2 import Environment, PackageLoader
 
 from wholearm_jax.core import Status
 from wholearm_jax.plotting.palette import CONTACT_COLOURS, DARK_CONTACT_COLOURS, DARK_LINK_COLOURS, LINK_COLOURS
-from wholearm_jax.report.page_data import page_data
+from wholearm_jax.report.page_data import page_data, split_columns
 from wholearm_jax.report.result_folder import ResultFolder, critical_phase, load_result_folder
 
 DASH = "\N{EN DASH}"  # for undefined numbers
@@ -50,6 +51,7 @@ def render(result: ResultFolder) -> str:
         advice=Status[summary["status"].upper()].advice,
         critical=critical_phase(summary),
         rows=[row | {"reached": _bound_fraction(row)} for row in summary["phases"]],
+        poses=_poses(result),
         settings=_settings(summary),
         scene_toml=tomli_w.dumps(summary["scene"]),
         colours={
@@ -68,6 +70,26 @@ def _bound_fraction(row: dict[str, Any]) -> str:
     if row["status"] != Status.OK.label or not bound or margin is None:
         return DASH
     return f"{100 * margin / bound:.1f} %" if margin > 0 and bound > 0 else DASH
+
+
+def _poses(result: ResultFolder) -> list[dict[str, str]]:
+    """Return where each phase that moves begins and ends, its displacement and its turn: in millimetres and degrees."""
+    poses = []
+    for name, rows in result.trajectories.items():
+        z = split_columns(rows)["z"]
+        begin, end = z[0], z[-1]
+        pose = {"name": name, "begin": _millimetres(begin[:2]), "end": _millimetres(end[:2])}
+        pose |= {"begin_angle": _degrees(begin[2]), "end_angle": _degrees(end[2])}
+        poses.append(pose | {"displacement": _millimetres((end - begin)[:2]), "turn": _degrees(end[2] - begin[2])})
+    return poses
+
+
+def _millimetres(position) -> str:
+    return ", ".join(f"{round(1e3 * float(x), 1) + 0.0:.1f}" for x in position)
+
+
+def _degrees(angle: float) -> str:
+    return f"{round(math.degrees(angle), 1) + 0.0:.1f}"
 
 
 def _settings(summary: dict[str, Any]) -> dict[str, str]:

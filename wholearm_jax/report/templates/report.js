@@ -128,7 +128,7 @@ function ticks(low, high, count) {
 
 // A plot: `curves` of {t, v, colour, dash, width}, `levels` of {v, colour, dash}; returns the line that shows the time.
 function plot(svg, curves, levels, dot) {
-  const width = Math.max(240, svg.parentElement.clientWidth), height = 210;
+  const width = Math.max(240, svg.parentElement.clientWidth), height = width < 480 ? 140 : 210;
   const edge = { left: 40, right: 8, top: 18, bottom: 24 };
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   svg.replaceChildren();
@@ -277,9 +277,10 @@ function start() {
     svg.addEventListener("pointermove", scrub);
   }
   const newton = 10 ** Math.floor(Math.log10(forceLargest));
-  byId("scale").textContent = forceLargest > 0
+  const scaleText = forceLargest > 0
     ? `${newton} N is as long as ${(1000 * metresPerNewton * newton).toFixed(1)} mm.`
     : "Friction holds the object at rest: the forces are not determined.";
+  for (const place of document.querySelectorAll(".scale")) place.textContent = scaleText;
   strip((time) => { pause(); seek(time); });
   new ResizeObserver(rebuild).observe(byId("torques").parentElement);
   rebuild();
