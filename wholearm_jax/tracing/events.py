@@ -76,7 +76,7 @@ class EventFunctions(NamedTuple):
             along=here.along,
         )
 
-    def residual(self, z: Float[Array, "5"], side: Float[Array, "rows"]) -> Float[Array, "rows"]:
+    def residual(self, z: Float[Array, "5"], side: float | Float[Array, "*rows"]) -> Float[Array, "*rows"]:
         """Evaluate what vanishes where an event is met on a `side` (1 or -1)."""
         return self._values(contact_kinematics(self.contacts, z), z) - side * self.half_width
 
