@@ -14,6 +14,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -49,9 +50,11 @@ class SolverState(eqx.Module):
     defect_norm: Float[Array, ""]  # |e|_1
 
     # Step control, from `solver`
-    step_scale: Float[Array, ""]  # factor of every step
-    merit_tolerance: Float[Array, ""]  # most by which a step may raise the merit; infinite: merit not computed
-    regularisation: Float[Array, ""]  # of the interior point's system
+    step_scale: Float[Array | np.ndarray, ""]  # factor of every step
+    merit_tolerance: Float[
+        Array | np.ndarray, ""
+    ]  # most by which a step may raise the merit; infinite: merit not computed
+    regularisation: Float[Array | np.ndarray, ""]  # of the interior point's system
 
     # Merit at `previous`, and the barrier parameter that it holds for
     merit: Float[Array, ""]

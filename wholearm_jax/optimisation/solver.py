@@ -91,7 +91,7 @@ def solve(
         # Choose the next step: full, damped where iterates cycle, or closing the defects once the margin has settled.
         settled = _has_settled(problem, measures, record.margin - margin_before)
         cycling = not settled and iteration >= problem.steps // 3 and measures.defect_norm > CYCLING_DEFECT
-        cycles, margin_before = cycles + cycling, record.margin
+        cycles, margin_before = cycles + int(cycling), record.margin
         d = replace(after, **(_CLOSING if settled else _damped(cycles) if cycling else _FULL))
     return d.p, f"the limit of {problem.steps} steps", history
 
