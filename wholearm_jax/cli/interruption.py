@@ -35,7 +35,11 @@ def exit_on_interrupt() -> Callable[[], None]:
         signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
         threading.Thread(target=_exit_on_signal, args=(_read_end,), name="interrupt", daemon=True).start()
     before = signal.signal(signal.SIGINT, _leave_to_thread)
-    return lambda: signal.signal(signal.SIGINT, before) and None
+
+    def restore() -> None:
+        signal.signal(signal.SIGINT, before)
+
+    return restore
 
 
 def _leave_to_thread(number, frame) -> None:
@@ -76,11 +80,17 @@ def _is_being_written(folder: Path) -> bool:
         return any(now - entry.stat().st_mtime < CACHE_QUIET for entry in entries)
 
 
+def quieten_workers() -> None:
+    """Keep the process that tidies up after ended workers, which is yet to be started, from reporting each of them."""
+    others = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (others, "ignore:resource_tracker")))
+
+
 def _end_workers() -> None:
     """End the processes that this one has started."""
     if processes := sys.modules.get("multiprocessing.process"):
         for child in processes.active_children():
-            child.kill()
+            os.kill(child.pid, signal.SIGKILL)  # joblib's have no `kill`
 
 
 if sys.argv[:1] == ["-m"] or Path((sys.argv or [""])[0]).stem == "wholearm":
