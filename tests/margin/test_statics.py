@@ -55,7 +55,7 @@ def of_block(**changed):
 def test_a_block_squeezed_by_two_fingers(torque):
     """The squeeze is `(tau + D) / h` at most; friction pushes the block onto the palm by `mu` of it on each side."""
     squeeze = (torque + DRY) / HEIGHT
-    found = of_block().support([torque, -torque])
+    found = of_block().margin_under([torque, -torque])
     assert found.margin == pytest.approx(min(squeeze, WEIGHT / 2 + MU * squeeze), rel=1e-9)
     assert found.contact.startswith("finger" if squeeze < WEIGHT / 2 + MU * squeeze else "palm")
 
@@ -63,7 +63,7 @@ def test_a_block_squeezed_by_two_fingers(torque):
 def test_the_best_squeeze_is_at_the_limit():
     found = of_block().best()
     assert found.margin == pytest.approx(WEIGHT / 2 + MU * (LIMIT + DRY) / HEIGHT, rel=1e-9)
-    assert of_block().support(found.torque).margin == pytest.approx(found.margin, rel=1e-9)
+    assert of_block().margin_under(found.torque).margin == pytest.approx(found.margin, rel=1e-9)
 
 
 @pytest.mark.parametrize("swapped", [False, True])
@@ -113,21 +113,21 @@ def _least_force(mu, dry, limits) -> float:
 
 def test_fingers_that_pull_would_have_to_adhere():
     """Without dry friction each finger's pressure is `tau / h`; where that is negative it is the adhesion needed."""
-    found = of_block(dry=(0.0, 0.0)).support([-0.03, 0.03])
+    found = of_block(dry=(0.0, 0.0)).margin_under([-0.03, 0.03])
     assert found.margin == pytest.approx(-0.03 / HEIGHT, rel=1e-9)
     assert found.contact.startswith("finger")
 
 
 def test_what_no_adhesion_holds():
     """A push from one side alone, without any friction."""
-    assert of_block(friction=0.0, dry=(0.0, 0.0)).support([0.05, -0.02]).margin == -np.inf
+    assert of_block(friction=0.0, dry=(0.0, 0.0)).margin_under([0.05, -0.02]).margin == -np.inf
 
 
 def test_units_do_not_matter():
     """A million times the mass and the torque: a million times the margin."""
     heavy = of_block(mass=MASS * 1e6, dry=(DRY * 1e6, DRY * 1e6))
-    small = of_block().support([0.05, -0.04]).margin
-    assert heavy.support([0.05e6, -0.04e6]).margin == pytest.approx(1e6 * small, rel=1e-9)
+    small = of_block().margin_under([0.05, -0.04]).margin
+    assert heavy.margin_under([0.05e6, -0.04e6]).margin == pytest.approx(1e6 * small, rel=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,7 @@ def test_the_margin_over_time_is_exact(slide_hold_flip):
         held = rest_margin(balance, schedule, 0.1, 0.9)
         times = np.union1d(np.linspace(0.1, 0.9, 17), [0.4])
         torques = np.stack([np.interp(times, schedule.times, knots[:, k]) for k in range(2)], axis=1)
-        margins = np.array([balance.support(torque).margin for torque in torques])
+        margins = np.array([balance.margin_under(torque).margin for torque in torques])
         assert held.margin == pytest.approx(margins.min(), abs=1e-9)
         assert held.time == pytest.approx(times[np.argmin(margins)], abs=1e-12)
         assert (held.loss_time is None) == bool(margins.min() >= -1e-7)
@@ -167,7 +167,7 @@ def test_the_margin_over_time_is_exact(slide_hold_flip):
             losses += 1
             around = held.loss_time + np.array([-1e-6, 1e-6])
             before, after = (np.array([np.interp(t, schedule.times, knots[:, k]) for k in range(2)]) for t in around)
-            assert balance.support(before).margin >= 0 > balance.support(after).margin
+            assert balance.margin_under(before).margin >= 0 > balance.margin_under(after).margin
     assert losses, "no hold is lost on its way: it is no test"
 
 
@@ -274,10 +274,10 @@ def test_the_way_to_a_hold_and_on_keeps_the_rate_limit(slide_hold_flip, duration
     np.testing.assert_array_equal(times[[0, -1]], [0.0, duration])
     assert rates.max() == pytest.approx(rate, rel=1e-9)
     balance, departure = statics_at_start(scene, scene.phases[1], traced[1])
-    best = balance.steadiest(departure).torque
+    best = balance.most_central_torque(departure).torque
     reached = np.abs(values - best).max(1).min()
     assert reached < 1e-12 if duration == 1.0 else 0 < reached < np.abs(after - best).max()
-    margins = [balance.support(torque).margin for torque in values]
+    margins = [balance.margin_under(torque).margin for torque in values]
     assert min(margins) >= min(margins[0], margins[-1]) - 1e-9
 
 
@@ -306,7 +306,7 @@ def test_motion_that_stops_holds_and_starts_again():
     stopped = motion.s[int(np.argmax(motion.at_rest))]
     assert float(motion.s[motion.count]) > float(stopped) > float(dynamics.breakpoints[0])
     z = wa.trajectory(wa.simulate(alone, schedule))[0].z[60]  # at 0.3 s, give or take
-    weakest = contact_statics(alone, alone.phases[0].formation, z).support(0.9 * still)
+    weakest = contact_statics(alone, alone.phases[0].formation, z).margin_under(0.9 * still)
     assert rests[0].margin == pytest.approx(weakest.margin, rel=1e-6)
     for held in rests:
         assert held.loss_time is None
@@ -329,4 +329,4 @@ def test_a_rest_between_rounded_times_has_its_own_torque():
     for schedule, start, end in ((until, 0.1, before), (since, after, 1.0)):
         held = rest_margin(balance, schedule, start, end)
         assert held.loss_time is None
-        assert held.margin == pytest.approx(balance.support(squeeze).margin, rel=1e-9)
+        assert held.margin == pytest.approx(balance.margin_under(squeeze).margin, rel=1e-9)

@@ -47,7 +47,7 @@ def share_of(change, torque, begin):
     stays = ahead <= 1e-9 - MIN_REST_MARGIN and behind >= MIN_REST_MARGIN - 1e-9
     if not (stays and braking < 0 and abs(setting_out) < 1e-6):
         return -np.inf
-    held = rest.statics.support(torque).margin / rest.bound
+    held = rest.statics.margin_under(torque).margin / rest.bound
     return min(forces.min() / before.bound, next_forces.min() / onward.bound, held)
 
 

@@ -1,34 +1,22 @@
 """Contact forces, their exact minimum over time, quasi-static torques, upper bounds, statics of rest."""
 
+from wholearm_jax.margin.barrier_minimum import log_barrier_minimum
 from wholearm_jax.margin.contact_forces import (
-    MAX_REFINED,
     MAX_ROLLING,
     SAMPLES_PER_STEP,
-    MarginResult,
     cone_facets,
     contact_force,
     force_slack,
     is_duplicate_facet,
-    log_barrier_minimum,
-    minimum_margin,
     sampled_slacks,
 )
+from wholearm_jax.margin.exact_margin import MAX_REFINED, MarginResult, minimum_margin
 from wholearm_jax.margin.quasistatic import (
-    BOUND_PLACES,
-    BOUND_SPEEDS,
-    MAX_SPEED_RATIO,
-    MarginBound,
     acceleration_terms,
     affine_coefficients,
     best_quasistatic_torque,
     best_quasistatic_torque_batch,
-    margin_upper_bound,
 )
-from wholearm_jax.margin.statics import (
-    MARGIN_TIE,
-    RestAccelerations,
-    RestInterval,
-    Statics,
-    contact_statics,
-    rest_margin,
-)
+from wholearm_jax.margin.rest_interval import RestInterval, rest_margin
+from wholearm_jax.margin.statics import MARGIN_TIE, RestAccelerations, Statics, contact_statics
+from wholearm_jax.margin.upper_bound import BOUND_PLACES, BOUND_SPEEDS, MAX_SPEED_RATIO, MarginBound, margin_upper_bound

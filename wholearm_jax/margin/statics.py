@@ -1,16 +1,13 @@
-r"""Hold: the statics of an object that friction keeps at rest, and the margin with which it is kept.
+r"""Statics of an object that friction holds at rest, and the margin of the contacts.
 
 At rest at `z` the forces of the contacts, `c_n` and `c_t` of each, and the dry friction `d` of the joints balance
 
     g + E tau + d + G_n^T c_n + G_t^T c_t = 0,     |c_t| <= mu c_n,     |d_i| <= D_i.
 
-These are five equations for ten unknowns: the forces are not determined. The *margin* of a hold is therefore, by
-definition, the largest `m` for which some forces within these limits have `c_n >= m` at every contact: the value of a
-linear programme. Where there are none at all, it is minus the least adhesion `a` with which there would be,
-`|c_t| <= mu (c_n + a)`.
-
-Both are concave functions of the torque. While torque is linear in time, the least margin is thus at one end of the
-interval, and the moment at which a hold becomes impossible is the solution of one more linear programme.
+These are five equations for ten unknowns: the forces are not determined. The *margin* at rest is by definition the
+largest `m` for which some forces within these limits have `c_n >= m` at every contact: the value of a linear programme.
+Where no forces are possible, it is minus the least adhesion `a` with which some would be, `|c_t| <= mu (c_n + a)`. Both
+are concave functions of the torque. Derivation: section 4 of `docs/derivation.md`.
 """
 
 from dataclasses import dataclass
@@ -24,63 +21,36 @@ from wholearm_jax.core import LinearProgramme, LinearProgrammeSolution
 from wholearm_jax.model import (
     ContactFormation,
     Scene,
-    TorqueSchedule,
     normal_jacobian,
     rigid_body,
     scaled_mechanics,
     tangential_jacobian,
-    time_tolerance,
 )
 
-FEASIBILITY_TOL = -1e-8  # least margin that counts as possible, over the unit of force: rounding
 MARGIN_CAP = 1e6  # the largest margin, over the unit of force: friction may let forces grow without end
 NO_ROWS = np.zeros((0, 3))
-MARGIN_TIE = (
-    0.99  # share of the best margin for which a hold's torque moves away from where the object would start to move
-)
-
-
-class RestInterval(NamedTuple):
-    """An object at rest for a while: `start` and `end` [s], its least margin [N], when, and at which contact.
-
-    `loss_time` is the time from which no forces can hold it there, None where some always can.
-    """
-
-    start: float
-    end: float
-    margin: float
-    time: float
-    contact: str
-    loss_time: float | None
-
-    @property
-    def message(self) -> str:
-        """What friction holds, in one line."""
-        span = f"held at rest from {self.start:.4g} to {self.end:.4g} s"
-        if self.loss_time is not None:
-            return f"{span}: not possible from t = {self.loss_time:.6g} s, {self.contact} would have to pull"
-        return f"{span}, hold's margin {self.margin:.4g} N at {self.contact}"
+MARGIN_TIE = 0.99  # fraction of the best margin that a torque farther from those that move the object may keep
 
 
 class StaticMargin(NamedTuple):
-    """The best that contacts can do at rest: `margin` [N], the `contact` that limits it, a `torque` [N m] for it."""
+    """The margin at rest."""
 
-    margin: float
-    contact: str
-    torque: Float[np.ndarray, "2"]
+    margin: float  # [N]
+    contact: str  # that limits it
+    torque: Float[np.ndarray, "2"]  # with which it is attained [N m]
 
 
 class RestAccelerations(NamedTuple):
-    """Accelerations `d2s/dt2` at rest, linear in `(1, tau1, tau2)`, with the friction of travel forward and backward.
+    """Accelerations `d2s/dt2` at rest, linear in `(1, tau1, tau2)`.
 
-    An object stays while the first is not positive and the second not negative.
+    An object stays while the forward one is not positive and the backward one not negative.
     """
 
-    ahead: Float[np.ndarray, "3"]
-    behind: Float[np.ndarray, "3"]
+    ahead: Float[np.ndarray, "3"]  # with the friction of travel forward
+    behind: Float[np.ndarray, "3"]  # with the friction of travel backward
 
     def rest_rows(self, torque_unit: float | np.ndarray = 1.0) -> Float[np.ndarray, "2 3"]:
-        """Rows with `row @ (1, torque) <= 0` while the object stays, of unit size in the torque, in `torque_unit`."""
+        """Return rows with `row @ (1, torque) <= 0` while the object stays, of unit size in the torque."""
         rows = np.stack([self.ahead, -self.behind])
         rows[:, 1:] *= torque_unit
         return rows / np.linalg.norm(rows[:, 1:], axis=1, keepdims=True)
@@ -90,48 +60,48 @@ class RestAccelerations(NamedTuple):
 class Statics:
     """The balance of forces at one configuration: `wrench @ (c_n, c_t, d) + load @ (1, tau1, tau2) = 0`.
 
-    Its rows are forces in units of `unit` [N], torques divided by the object's radius; the torques `tau` are in N m.
+    Its rows are forces over `unit`, or torques over the object's radius and `unit`.
     """
 
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the contacts
     wrench: Float[np.ndarray, "5 unknowns"]
-    load: Float[np.ndarray, "5 3"]
-    friction: Float[np.ndarray, "contacts"]
-    dry: Float[np.ndarray, "2"]
-    torque_limit: Float[np.ndarray, "2"]
-    unit: float
+    load: Float[np.ndarray, "5 3"]  # of weight and torques [N m]
+    friction: Float[np.ndarray, "contacts"]  # coefficients
+    dry: Float[np.ndarray, "2"]  # largest dry friction of the joints
+    torque_limit: Float[np.ndarray, "2"]  # [N m]
+    unit: float  # [N]
 
-    def support(self, torque) -> StaticMargin:
-        """The hold's margin under a given torque [N m]."""
+    def margin_under(self, torque) -> StaticMargin:
+        """Compute the margin under a given torque [N m]."""
         return self._best(np.column_stack([torque, torque]))
 
     def best(self, departure: RestAccelerations | None = None) -> StaticMargin:
-        """The largest margin of all torques within limits; with a `departure`, of those that do not move the object."""
+        """Compute the largest margin of all torques within limits, or with a `departure` of those that move nothing."""
         limits = np.column_stack([-self.torque_limit, self.torque_limit])
         return self._best(limits, NO_ROWS if departure is None else departure.rest_rows())
 
-    def steadiest(self, departure: RestAccelerations) -> StaticMargin:
-        """A torque with `MARGIN_TIE` of the largest margin, as far as it can be from those that move the object."""
-        limits, still = np.column_stack([-self.torque_limit, self.torque_limit]), departure.rest_rows()
-        top = self._best(limits, still)
+    def most_central_torque(self, departure: RestAccelerations) -> StaticMargin:
+        """Compute a torque with `MARGIN_TIE` of the largest margin, farthest from those that move the object."""
+        limits, rest_rows = np.column_stack([-self.torque_limit, self.torque_limit]), departure.rest_rows()
+        top = self._best(limits, rest_rows)
         if not top.margin > 0:
             return top
         floor = MARGIN_TIE * top.margin / self.unit
-        central = self._maximise(limits, (0.0, np.inf), floor=floor, still=still, apart=1.0)
-        return top if central is None else self.support(central.values["torque"])
+        central = self._maximise(limits, (0.0, np.inf), floor=floor, rest_rows=rest_rows, apart=1.0)
+        return top if central is None else self.margin_under(central.values["torque"])
 
     def loss_fraction(self, before, after) -> float:
-        """The share of the way between two torques from which no forces hold the object: 1 if some always do."""
+        """Compute the fraction of the way between two torques from which no forces hold the object (1: none)."""
         ends = np.stack([before, after])
         limits = np.column_stack([ends.min(0), ends.max(0)])
         last = self._maximise(limits, (0.0, 1.0), path=ends)
         return 0.0 if last is None else float(last.values["m"][0])
 
-    def _best(self, limits, still=NO_ROWS) -> StaticMargin:
+    def _best(self, limits, rest_rows=NO_ROWS) -> StaticMargin:
         """Maximise the margin; where no forces are possible, minus the least adhesion."""
-        best = self._maximise(limits, (0.0, MARGIN_CAP), press=1.0, still=still)
+        best = self._maximise(limits, (0.0, MARGIN_CAP), press=1.0, rest_rows=rest_rows)
         if best is None:
-            best = self._maximise(limits, (-np.inf, 0.0), press=1.0, adhesion=1.0, still=still)
+            best = self._maximise(limits, (-np.inf, 0.0), press=1.0, adhesion=1.0, rest_rows=rest_rows)
         if best is None:
             return StaticMargin(-np.inf, self.names[0], limits.mean(1))
         margin, multipliers = float(best.values["m"][0]), best.multipliers
@@ -141,9 +111,9 @@ class Statics:
         return StaticMargin(margin * self.unit, self.names[weakest], best.values["torque"])
 
     def _maximise(
-        self, limits, bounds, *, press=0.0, floor=0.0, adhesion=0.0, still=NO_ROWS, apart=0.0, path=None
+        self, limits, bounds, *, press=0.0, floor=0.0, adhesion=0.0, rest_rows=NO_ROWS, apart=0.0, path=None
     ) -> LinearProgrammeSolution | None:
-        """Maximise `m` within `bounds` over forces as in `add_forces`, with `still @ (1, torque) <= -apart m`.
+        """Maximise `m` within `bounds` over forces as in `add_forces`, with `rest_rows @ (1, torque) <= -apart m`.
 
         Along a `path`, `torque = path[0] + m (path[1] - path[0])`.
         """
@@ -151,7 +121,7 @@ class Statics:
         self.add_forces(programme, level="m", press=press, floor=floor, adhesion=adhesion)
         programme.add_variables("torque", *limits.T)
         programme.add_variables("m", *bounds)
-        programme.at_most("rest", -still[:, 0], torque=still[:, 1:], m=apart)
+        programme.at_most("rest", -rest_rows[:, 0], torque=rest_rows[:, 1:], m=apart)
         if path is not None:
             programme.equal("path", path[0], torque=np.eye(2), m=path[0] - path[1])
         return programme.maximise("m")
@@ -194,17 +164,17 @@ class Statics:
 
 
 def contact_statics(scene: Scene, formation: ContactFormation, z: Float[Array | np.ndarray, "5"]) -> Statics:
-    """The balance of forces for an object at rest at `z` (SI) in a formation, of however many contacts."""
-    mechanics, normal, slip = jax.device_get(_rows(scene, formation, z))
-    slots, joints = list(formation.normal_rows), np.eye(5)[:, 3:]
+    """Assemble the balance of forces of an object at rest at `z` (SI), in a formation of any number of contacts."""
+    mechanics, normal, slip = jax.device_get(_contact_rows(scene, formation, z))
+    rows, joints = list(formation.normal_rows), np.eye(5)[:, 3:]
     force, radius = float(mechanics.force_unit), float(mechanics.length)
     weight = np.append(mechanics.inertia[0] * mechanics.gravity * force, np.zeros(3))
     unit = float(np.abs(weight).max() + mechanics.torque_limit.max() / radius)
     return Statics(
         names=formation.names,
-        wrench=np.hstack([normal[slots].T, slip[slots].T, joints]),
+        wrench=np.hstack([normal[rows].T, slip[rows].T, joints]),
         load=np.column_stack([weight, joints / radius]) / unit,
-        friction=np.asarray(mechanics.contacts.friction)[slots],
+        friction=np.asarray(mechanics.contacts.friction)[rows],
         dry=np.asarray(mechanics.dry) * force / unit,
         torque_limit=np.asarray(mechanics.torque_limit),
         unit=unit,
@@ -212,39 +182,7 @@ def contact_statics(scene: Scene, formation: ContactFormation, z: Float[Array | 
 
 
 @jax.jit
-def _rows(scene: Scene, formation: ContactFormation, z):
+def _contact_rows(scene: Scene, formation: ContactFormation, z):
     mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, formation)
     here = z / mechanics.configuration_unit
     return mechanics, normal_jacobian(mechanics.contacts, here), tangential_jacobian(mechanics.contacts, here)
-
-
-def rest_margin(balance: Statics, schedule: TorqueSchedule, start: float, end: float) -> RestInterval:
-    """The margin of a hold from `start` to `end` [s] under a schedule, exactly: linear torque, concave margin."""
-    times, torques = _corners(schedule, start, end)
-    supports = [balance.support(torque) for torque in torques]
-    worst = int(np.argmin([one.margin for one in supports]))
-    floor = FEASIBILITY_TOL * balance.unit
-    bad = next((k for k, one in enumerate(supports) if one.margin < floor), None)
-    lost, which = None, supports[worst].contact
-    if bad is not None:
-        which = supports[bad].contact
-        share = balance.loss_fraction(torques[bad - 1], torques[bad]) if bad > 0 else 1.0
-        lost = times[max(bad - 1, 0)] + share * (times[bad] - times[max(bad - 1, 0)])
-    return RestInterval(start, end, supports[worst].margin, times[worst], which, lost)
-
-
-def _corners(schedule: TorqueSchedule, start: float, end: float):
-    """Times and torques between which a schedule is linear from `start` to `end`; a step has both its sides, but for
-    one at `start` or `end`, where only what is between counts."""
-    times, values = np.asarray(schedule.times), np.asarray(schedule.values)
-    near = time_tolerance(times, start, end)
-    inside = (times > start + near) & (times < end - near)
-
-    def at(time, row):
-        row = int(np.clip(row, 0, len(times) - 2))
-        gap = times[row + 1] - times[row]
-        return values[row] + (values[row + 1] - values[row]) * ((time - times[row]) / gap if gap > 0 else 1.0)
-
-    first = np.searchsorted(times, start + near, side="right") - 1
-    last = np.searchsorted(times, end - near, side="left") - 1
-    return [start, *times[inside].tolist(), end], [at(start, first), *values[inside], at(end, last)]

@@ -102,7 +102,7 @@ def holding_schedule(
     if int(traced.dynamics.status) != Status.OK:
         return uniform_schedule(duration, np.zeros((knots, 2)))
     statics, accelerations = statics_at_start(scene, phase, traced)
-    best = statics.steadiest(accelerations).torque
+    best = statics.most_central_torque(accelerations).torque
     if rate_limit is None:
         return uniform_schedule(duration, np.tile(best, (knots, 1)))
     first, last = (at.torque if at is not None and at.is_feasible else best for at in (begin, end))
