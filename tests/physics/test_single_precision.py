@@ -71,6 +71,7 @@ REFUSING = """
 import sys
 import jax
 import wholearm_jax as wa
+from support import layered
 from wholearm_jax.ensembles import make_ensemble, optimise_robustly
 from wholearm_jax.phases.gradients import check_gradient, torque_gradient
 from wholearm_jax.planning import successor_formations, touching_contacts

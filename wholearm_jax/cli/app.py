@@ -24,7 +24,7 @@ from wholearm_jax.cli.report import report
 from wholearm_jax.cli.scenes import scenes
 from wholearm_jax.cli.search import search
 from wholearm_jax.cli.simulate import simulate
-from wholearm_jax.core import DoubtfulInput, configure, enable_program_cache
+from wholearm_jax.core import DoubtfulInput, configure, discard_unreadable_entry, keep_compiled
 
 UsageError: Any = typer.BadParameter.__mro__[1]  # of the library beneath, which Typer has under changing names
 
@@ -61,7 +61,7 @@ def main() -> None:
     if sys.argv[1:2] != ["check"]:  # `check` configures itself by the number of its scenes
         configure()
     _keep_compiled()
-    _print_doubts_as_notes()
+    _handle_warnings()
     try:
         sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False) or 0)
     except typer.Abort:
@@ -76,14 +76,14 @@ def main() -> None:
         restore_interrupt()
 
 
-def _print_doubts_as_notes() -> None:
-    """Print warnings about doubtful input as the notes of the command line."""
+def _handle_warnings() -> None:
+    """Print warnings about doubtful input as notes; discard a damaged file of its cache of which JAX warns."""
     show = warnings.showwarning
 
     def show_note(message, category, *others):
         if issubclass(category, DoubtfulInput):
             note(str(message))
-        else:
+        elif not discard_unreadable_entry(str(message)):
             show(message, category, *others)
 
     warnings.showwarning = show_note
@@ -94,10 +94,7 @@ def _keep_compiled() -> None:
     if jax.config.values["jax_compilation_cache_dir"] is not None or "JAX_ENABLE_COMPILATION_CACHE" in os.environ:
         return
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    folder = os.path.join(home, "wholearm_jax")
-    jax.config.update("jax_compilation_cache_dir", folder)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
-    enable_program_cache(Path(folder, "programs"))
+    keep_compiled(Path(home, "wholearm_jax"))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-r"""Eliminate: inverses and determinants of the small matrices that every place of a wire needs.
+r"""Inverses, determinants and products of small matrices.
 
 Gauss-Jordan elimination with row pivoting, as plain array operations, which a batch runs side by side. LAPACK's batched
 routines, as JAX calls them on processors, wait inside the pool of threads that they run on: on two processors a program
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 @jax.jit
 def inverse_and_determinant(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
-    """`A^-1` and `det A`. Of a singular matrix the first is not finite and the second 0.
+    """Return `A^-1` and `det A`; for a singular matrix the inverse is not finite and the determinant 0.
 
     Derivatives: `d(A^-1) = -A^-1 dA A^-1` and `d(det A) = det A tr(A^-1 dA)`.
     """
@@ -28,7 +28,7 @@ def _gauss_jordan(matrix):
     rows = jnp.arange(n)
 
     def clear(k, state):
-        """Make column `k` that of the identity."""
+        """Eliminate column `k`: pivot, scale, subtract."""
         wide, determinant = state
         candidates = jnp.where(rows >= k, jnp.abs(wide[:, k]), -1.0)
         p = jnp.argmax(candidates)
@@ -54,25 +54,25 @@ def _gauss_jordan_jvp(primals, tangents):
 
 
 def null_vector(rows: Float[Array, "4 5"]) -> Float[Array, "5"]:
-    """What is orthogonal to four rows: its product with any other row is the determinant of all five.
+    """Return the generalised cross product of four rows: its dot product with any row is the determinant of all five.
 
-    Each component is a determinant of four columns, by products of minors of the first and the last two rows (Laplace):
-    nothing is divided by, and rows that depend on one another give zero.
+    Each component is a determinant of four columns by Laplace expansion over pairs of rows. There is no division, and
+    linearly dependent rows give zero.
     """
     first, second = _PAIRS.T
-    upper, lower = (one[first] * other[second] - one[second] * other[first] for one, other in (rows[:2], rows[2:]))
+    upper, lower = (a[first] * b[second] - a[second] * b[first] for a, b in (rows[:2], rows[2:]))
     return (_SIGNS * upper[_UPPER] * lower[_LOWER]).sum(1)
 
 
 def _laplace() -> tuple[np.ndarray, ...]:
-    """Pairs of columns, and for each column left out: which pairs' minors are multiplied, with which signs."""
+    """Return the pairs of columns and, for each omitted column, the pairs of the minors to multiply, with signs."""
     pairs = list(itertools.combinations(range(5), 2))
     terms = []
     for out in range(5):
         for pair in (p for p in pairs if out not in p):
-            one, other = (k for k in range(5) if k != out and k not in pair)
-            sign = np.linalg.det(np.eye(5)[[*pair, one, other, out]])
-            terms.append((pairs.index(pair), pairs.index((one, other)), np.rint(sign)))
+            third, fourth = (k for k in range(5) if k != out and k not in pair)
+            sign = np.linalg.det(np.eye(5)[[*pair, third, fourth, out]])
+            terms.append((pairs.index(pair), pairs.index((third, fourth)), np.rint(sign)))
     return np.array(pairs), *(np.array(column).reshape(5, 6) for column in zip(*terms, strict=True))
 
 
@@ -80,13 +80,15 @@ _PAIRS, _UPPER, _LOWER, _SIGNS = _laplace()
 
 
 def fused_matmul(matrix: Float[Array, "m n"], right: Float[Array, "n *columns"]) -> Float[Array, "m *columns"]:
-    """The product with a vector or a matrix, as a sum of products, which is fused with what is about it: a call of a
-    library for matrices would take longer to prepare than it computes."""
+    """Multiply a matrix by a vector or a matrix as a sum of products.
+
+    XLA fuses the sum with the operations around it; a call of a matrix library costs more than so small a product.
+    """
     if right.ndim == 1:
         return (matrix * right).sum(1)
     return sum((matrix[:, k, None] * right[k] for k in range(1, len(right))), matrix[:, :1] * right[0])
 
 
 def solve(matrix: Float[Array, "n n"], right: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
-    """`A^-1 b`."""
+    """Return `A^-1 b`."""
     return fused_matmul(inverse_and_determinant(matrix)[0], right)

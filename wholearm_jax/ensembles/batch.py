@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from wholearm_jax.core import require_positive, require_x64
+from wholearm_jax.core import on_host, require_positive, require_x64
 from wholearm_jax.ensembles.ensemble import Ensemble
 from wholearm_jax.ensembles.passes import run_pass
 from wholearm_jax.ensembles.scene_batch import SceneBatch, stack_scenes
@@ -28,6 +28,7 @@ BATCH_ARRIVAL = 0.01  # fraction of the path: scenes that vary cannot end exactl
 MIN_COARSE_TOLERANCE = 1e-9  # [N], smaller tolerances begin at the full resolution
 
 
+@on_host("check outside of the transformation; jax.vmap takes wholearm_jax.margin")
 def check(
     scenes: Ensemble | Scene | Sequence[Scene],
     torque: TorqueSchedule,

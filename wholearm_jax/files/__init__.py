@@ -11,16 +11,8 @@ from wholearm_jax.files.results import (
     write_torque,
     write_trajectory,
 )
-from wholearm_jax.files.scene_toml import (
-    Positive,
-    bundled,
-    explain_validation_error,
-    load,
-    load_start,
-    parse,
-    save,
-    to_dict,
-)
+from wholearm_jax.files.scene_schema import Positive, explain_validation_error
+from wholearm_jax.files.scene_toml import bundled, load, load_start, parse, save, to_dict
 from wholearm_jax.files.torque_csv import read_torque
 
 __all__ = [

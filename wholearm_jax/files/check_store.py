@@ -3,6 +3,7 @@
 A chunk of every array is one file, written whole by one process; the chunk's entry in `done` is written last. A process
 that is stopped, at any moment, leaves a store that can be read; opened again, it continues with the chunks that are not
 done. The store is identified (`store_metadata`): another scene, schedule, seed, setting or version is refused.
+Arrays hold numbers alone, and a store of another format is not opened: reading one runs no code.
 """
 
 import hashlib
@@ -23,6 +24,7 @@ from wholearm_jax.ensembles import BatchResult
 KIND = "wholearm_jax check"
 # Status, contact and phase numbers are small; -1 marks "none".
 TYPES = {"status": "int8", "margin": "float64", "time": "float64", "contact": "int8", "phase": "int8", "end": "float64"}
+OTHER_TYPES = {"torque": "float64", "done": "uint8"}
 
 
 def fingerprint(*trees: Any) -> str:
@@ -53,9 +55,10 @@ class Store:
         return np.asarray(self.array("done")[:]).astype(bool)
 
     def array(self, name: str) -> zarr.Array:
-        """Return one of the arrays, on disk."""
-        array = self.group[name]
-        assert isinstance(array, zarr.Array)
+        """Return one of the arrays, on disk. Raises `StoreError` for one that does not hold its type of numbers."""
+        array = self.group.get(name)
+        if not isinstance(array, zarr.Array) or str(array.dtype) != (TYPES | OTHER_TYPES)[name]:
+            raise StoreError(f"{self.path}: {name} is not an array of a check")
         return array
 
     def rows(self, number: int) -> slice:
@@ -86,13 +89,13 @@ def store_metadata(count: int, chunk: int, **settings: Any) -> dict[str, Any]:
 def open_store(path: Path, metadata: Mapping[str, Any], torques: int = 0) -> Store:
     """Open a store to continue, or make it. Raises `StoreError` for a path that holds something else."""
     try:
-        group = zarr.open_group(str(path), mode="r+")
+        group = zarr.open_group(str(path), mode="r+", zarr_format=3)
     except (FileNotFoundError, GroupNotFoundError):
         return _create_store(path, metadata, torques)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path}: not a store: {error}") from None
     stored = dict(group.attrs).get("identity")
-    if stored is None and not group.attrs and {*group.keys()} <= {*TYPES, "torque", "done"}:
+    if stored is None and not group.attrs and {*group.keys()} <= {*TYPES, *OTHER_TYPES}:
         return _create_store(path, metadata, torques, again=True)
     if not isinstance(stored, Mapping) or stored.get("kind") != KIND:
         raise StoreError(f"{path}: holds something else than a check")

@@ -1,7 +1,7 @@
-"""Polygons to put in a scene, many in one NumPy file.
+"""Polygons to put in a scene, total in one NumPy file.
 
 `vertices` (`n`, `k`, 2) [m], rows beyond a polygon's `count` (`n`) ignored; `count` may be left out where all have `k`
-vertices; `mass` (`n`) [kg] and `friction` (`n` or `n`, 3) may be given, otherwise they are the scene's. Density is
+vertices; `mass` (`n`) [kg] and `friction` (`n` or `n`, 3) may be vertices, otherwise they are the scene's. Density is
 uniform.
 """
 
@@ -20,7 +20,7 @@ _UNREADABLE = (OSError, ValueError, KeyError, AttributeError, TypeError, EOFErro
 
 
 def count_polygons(path: Path) -> int:
-    """How many polygons a file has; 0 where it is none, of which `read_polygons` tells more."""
+    """Return the number of polygons of a file; 0 for a file that `read_polygons` will refuse."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return len(file["vertices"])
@@ -29,52 +29,56 @@ def count_polygons(path: Path) -> int:
 
 
 def read_polygons(path: Path, scene: Scene) -> SceneBatch:
-    """The scene with each polygon of a file. Raises `SceneError` naming the file, the entry and what is wrong."""
+    """Return the scene with each polygon of a file.
+
+    Raises:
+        SceneError: Naming the file, the entry and what is wrong.
+    """
     try:
         with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-            held = {name: np.asarray(file[name]) for name in file.files}
+            entries = {name: np.asarray(file[name]) for name in file.files}
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file") from None
     except _UNREADABLE as error:
         raise SceneError(f"{path}: not a NumPy .npz file: {error}") from None
-    for name, values in held.items():
+    for name, values in entries.items():
         if values.dtype.kind not in "fiu":
             raise SceneError(f"{path}: {name}: needs real numbers, not {values.dtype}")
-    given = held.get("vertices")
-    if given is None or given.ndim != 3 or given.shape[2] != 2 or given.shape[1] < 3 or not len(given):
+    vertices = entries.get("vertices")
+    if vertices is None or vertices.ndim != 3 or vertices.shape[2] != 2 or vertices.shape[1] < 3 or not len(vertices):
         raise SceneError(f"{path}: vertices: needs an array (polygons, vertices, 2) of at least 3 vertices")
-    many, width = given.shape[:2]
-    count = held.get("count", np.full(many, width))
-    if count.shape != (many,) or count.dtype.kind not in "iu" or count.min() < 3 or count.max() > width:
+    total, width = vertices.shape[:2]
+    count = entries.get("count", np.full(total, width))
+    if count.shape != (total,) or count.dtype.kind not in "iu" or count.min() < 3 or count.max() > width:
         raise SceneError(f"{path}: count: needs one whole number of 3 to {width} a polygon")
-    _outlines(path, given, count)
+    _require_polygons(path, vertices, count)
     rows = np.minimum(np.arange(width + (-width % 8)), count[:, None] - 1)  # rows that pad repeat the last vertex
-    vertices = np.take_along_axis(np.asarray(given, float), rows[:, :, None], axis=1)
-    mass = _positive(path, "mass", held, (many,), np.asarray(scene.object.mass), strictly=True)
-    rubs = held.get("friction", np.asarray(scene.object.friction)[None])
-    rubs = rubs[:, None] if rubs.ndim == 1 else rubs
-    friction = _positive(path, "friction", {"friction": rubs}, (many, 3), None, strictly=False)
-    _named_vertices(path, scene, count)
+    vertices = np.take_along_axis(np.asarray(vertices, float), rows[:, :, None], axis=1)
+    mass = _read_positive(path, "mass", entries, (total,), np.asarray(scene.object.mass), strictly=True)
+    coefficients = entries.get("friction", np.asarray(scene.object.friction)[None])
+    coefficients = coefficients[:, None] if coefficients.ndim == 1 else coefficients
+    friction = _read_positive(path, "friction", {"friction": coefficients}, (total, 3), None, strictly=False)
+    _require_named_features(path, scene, count)
     shape = Polygon(vertices=vertices, count=count, mass=mass, friction=friction)  # pyright: ignore
-    alike = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (many, *np.shape(leaf))), scene)
-    return SceneBatch(Scene(scene.title, alike.gravity, alike.hand, shape, alike.start, alike.phases))
+    repeated = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (total, *np.shape(leaf))), scene)
+    return SceneBatch(Scene(scene.title, repeated.gravity, repeated.hand, shape, repeated.start, repeated.phases))
 
 
-def _outlines(path, vertices, count) -> None:
-    """Every row of vertices must be a polygon."""
+def _require_polygons(path, vertices, count) -> None:
+    """Refuse vertices that make no polygon."""
     for size in np.unique(count):
-        which = np.flatnonzero(count == size)
-        chosen = vertices[which, :size]
+        numbers = np.flatnonzero(count == size)
+        chosen = vertices[numbers, :size]
         finite = np.isfinite(chosen).all((1, 2))
         if not finite.all():
-            raise SceneError(f"{path}: vertices[{which[np.argmin(finite)]}]: not finite")
-        flaw = find_defect(np.asarray(chosen, float))
-        if flaw is not None:
-            raise SceneError(f"{path}: vertices[{which[flaw[0]]}]: {flaw[1]}")
+            raise SceneError(f"{path}: vertices[{numbers[np.argmin(finite)]}]: not finite")
+        defect = find_defect(np.asarray(chosen, float))
+        if defect is not None:
+            raise SceneError(f"{path}: vertices[{numbers[defect[0]]}]: {defect[1]}")
 
 
-def _positive(path, name: str, held, shape, otherwise, *, strictly: bool):
-    value = np.asarray(held.get(name, otherwise), float)
+def _read_positive(path, name: str, entries, shape, otherwise, *, strictly: bool):
+    value = np.asarray(entries.get(name, otherwise), float)
     try:
         value = np.broadcast_to(value, shape)
     except ValueError:
@@ -84,8 +88,8 @@ def _positive(path, name: str, held, shape, otherwise, *, strictly: bool):
     return value
 
 
-def _named_vertices(path, scene: Scene, count) -> None:
-    """Every polygon must have the vertices and edges that the formations name."""
+def _require_named_features(path, scene: Scene, count) -> None:
+    """Refuse polygons without the vertices and edges that the formations name."""
     highest = max(int(np.max(np.asarray(p.formation.feature))) for p in scene.phases)
     if count.min() <= highest:
         row = int(np.argmax(count <= highest))

@@ -20,7 +20,7 @@ def find_defect(outlines: Num[np.ndarray, "polygons vertices 2"]) -> tuple[int, 
     centred = outlines - outlines.mean(1, keepdims=True)
     thin = np.linalg.svd(centred, compute_uv=False)[:, 1] <= MIN_SEPARATION * size
     rings = shapely.linearrings(outlines)
-    crossing = ~shapely.is_valid(shapely.polygons(rings))
+    crossing = ~np.asarray(shapely.is_valid(shapely.polygons(rings)))
     bad = repeated.any(1) | thin | crossing | ~shapely.is_ccw(rings)
     if not bad.any():
         return None
@@ -53,7 +53,7 @@ def remains_simple(outline: Float[np.ndarray, "vertices 2"], moves: Float[np.nda
 
     It does where no vertex can come to an edge that is not its own.
     """
-    count, edges, points = len(outline), _edges(outline), shapely.points(outline)
+    count, edges, points = len(outline), _edges(outline), np.asarray(shapely.points(outline))
     reach = np.maximum(moves, np.roll(moves, -1))
     vertex, edge = shapely.STRtree(edges).query(points, predicate="dwithin", distance=moves + reach.max())
     own = (vertex == edge) | (vertex == (edge + 1) % count)
@@ -62,4 +62,4 @@ def remains_simple(outline: Float[np.ndarray, "vertices 2"], moves: Float[np.nda
 
 def _edges(outline: Float[np.ndarray, "vertices 2"]) -> np.ndarray:
     """Return the edges of an outline as an array of line strings."""
-    return shapely.linestrings(np.stack([outline, np.roll(outline, -1, axis=0)], axis=1))
+    return np.asarray(shapely.linestrings(np.stack([outline, np.roll(outline, -1, axis=0)], axis=1)))

@@ -8,6 +8,7 @@ import itertools
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from wholearm_jax.core import CachedJit, as_device_array
@@ -61,6 +62,18 @@ def _rest_to_rest_guesses(dynamics: PathDynamics, durations, knots: int, torque_
     others = [profile for profile in FALLBACK_PROFILES if SPEED_PROFILES[best] != profile]
     order = [best, *map(SPEED_PROFILES.index, others)]
     return [_variables([torque[k]], [motions[k]], durations) for k in order]
+
+
+def transformed_rest_to_rest_torques(dynamics: PathDynamics, duration, knots: int):
+    """Return the torques `(knots, 2)` [N m] of the first guess of a single phase, usable in JAX's transformations."""
+    s, v, a = (np.stack(rows) for rows in zip(*_profile_motions(knots), strict=True))
+    length, first = dynamics.breakpoints[-1] - dynamics.breakpoints[0], dynamics.breakpoints[0]
+    best = _best_torques(dynamics, first + length * s, length * v / duration, length * a / duration**2)
+    margins = best.margin.min(1)
+    largest = margins.max()
+    is_first_enough = margins[0] >= largest - PROFILE_ADVANTAGE * jnp.abs(largest)
+    chosen = jnp.where(is_first_enough, 0, jnp.argmax(margins))
+    return jnp.clip(best.torque[chosen], -dynamics.torque_limit, dynamics.torque_limit)
 
 
 def _transition_motions(phase_dynamics, durations, knots: int, ratios: list[float], speed: float) -> list[UnitMotion]:

@@ -42,7 +42,7 @@ import equinox as eqx
 import numpy as np
 import optax
 
-from wholearm_jax.core import Status, require_positive, require_x64, wait_for
+from wholearm_jax.core import Status, on_host, require_positive, require_x64, wait_for
 from wholearm_jax.margin import MarginBound
 from wholearm_jax.model import Arrival, Scene, TorqueSchedule, concatenate_schedules, replace_duration
 from wholearm_jax.optimisation.coupled_phases import (
@@ -83,6 +83,7 @@ class OptimisationResult:
         return tuple(p.margin / float(b.value) if float(b.value) > 0 else float("nan") for p, b in pairs)
 
 
+@on_host("optimise outside, and transform wholearm_jax.margin with the schedule")
 def optimise(
     scene: Scene,
     *,

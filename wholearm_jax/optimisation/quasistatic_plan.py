@@ -6,15 +6,22 @@ Derivation: section 8 of `docs/derivation.md`.
 from collections.abc import Sequence
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from wholearm_jax.core import CachedJit, Status, as_device_array, require_x64
+from wholearm_jax.core import CachedJit, Status, as_device_array, computed_at_once, is_traced, require_x64
 from wholearm_jax.dynamics import PathDynamics
-from wholearm_jax.margin import MarginBound, affine_coefficients, best_quasistatic_torque, margin_upper_bound
+from wholearm_jax.margin import (
+    MAX_ROLLING,
+    MarginBound,
+    affine_coefficients,
+    best_quasistatic_torque,
+    margin_upper_bound,
+)
 from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, concatenate_schedules, uniform_schedule
-from wholearm_jax.optimisation.initial_guess import initial_guesses
+from wholearm_jax.optimisation.initial_guess import initial_guesses, transformed_rest_to_rest_torques
 from wholearm_jax.optimisation.plan_transitions import holding_schedule
 from wholearm_jax.phases import PhaseResult, Result, TracedPhase, configuration, statics_at_start, trace
 
@@ -45,14 +52,38 @@ def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[TracedPhase, ...
     """
     require_x64(scene)
     require_knots(knots)
+    if is_traced(scene, traced):
+        return _transformed_quasistatic(scene, knots, traced or trace(scene))
+    return _quasistatic_of_numbers(scene, knots, traced or trace(scene))
 
+
+def _transformed_quasistatic(scene: Scene, knots: int, traced: tuple[TracedPhase, ...]) -> TorqueSchedule:
+    """Return the schedule of `quasistatic` for a plan that is being transformed."""
+    _refuse_holds(scene, "quasistatic")
+    times, torques, begin = [], [], 0.0
+    for path, phase in zip(traced, scene.phases, strict=True):
+        times.append(begin + phase.duration * np.linspace(0.0, 1.0, knots))
+        torques.append(transformed_rest_to_rest_torques(path.dynamics, phase.duration, knots))
+        begin = begin + phase.duration
+    return TorqueSchedule(jnp.concatenate(times), jnp.concatenate(torques))
+
+
+def _refuse_holds(scene: Scene, name: str) -> None:
+    """Raise TypeError for a plan with a phase that holds the object, which linear programmes on the host assess."""
+    held = next((phase.name for phase in scene.phases if phase.arrive is Arrival.HOLD), None)
+    if held is not None:
+        raise TypeError(f"{name} cannot be transformed (jit, grad, vmap) with phase '{held}', which holds the object")
+
+
+@computed_at_once
+def _quasistatic_of_numbers(scene: Scene, knots: int, traced: tuple[TracedPhase, ...]) -> TorqueSchedule:
     def schedule(path, phase):
         if phase.arrive is Arrival.HOLD:
             return holding_schedule(scene, phase, path, knots)
         guess = initial_guesses([path.dynamics], [float(phase.duration)], knots, 1.0)[0]
         return uniform_schedule(float(phase.duration), path.dynamics.torque_limit * guess.torque[0])
 
-    return concatenate_schedules([schedule(*pair) for pair in zip(traced or trace(scene), scene.phases, strict=True)])
+    return concatenate_schedules([schedule(*pair) for pair in zip(traced, scene.phases, strict=True)])
 
 
 def bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[MarginBound, ...]:
@@ -75,7 +106,34 @@ def bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[Margi
     ['0.966 N', '0.838 N']
     """
     require_x64(scene)
-    starts_at_rest = [True, *(p.arrive is not Arrival.MOVING for p in scene.phases[:-1])]
+    if is_traced(scene, traced):
+        return _transformed_bounds(scene, traced or trace(scene))
+    return _bounds_of_numbers(scene, traced or trace(scene))
+
+
+def _transformed_bounds(scene: Scene, traced: tuple[TracedPhase, ...]) -> tuple[MarginBound, ...]:
+    """Return the bounds of a plan that is being transformed."""
+    _refuse_holds(scene, "bounds")
+    starts_at_rest = _starts_at_rest(scene)
+
+    def bound(path, phase, from_rest):
+        ends = jnp.asarray(from_rest), jnp.asarray(phase.arrive is Arrival.AT_REST)
+        rolling = MAX_ROLLING if is_traced(phase.formation.tangential) else rolling_count(phase)
+        found = upper_bound(path.dynamics, phase.duration, *ends, rolling)
+        known = path.dynamics.status == int(Status.OK)
+        return eqx.tree_at(lambda b: b.value, found, jnp.where(known, found.value, -jnp.inf))
+
+    return tuple(bound(*row) for row in zip(traced, scene.phases, starts_at_rest, strict=True))
+
+
+def _starts_at_rest(scene: Scene) -> list[bool]:
+    """Say for each phase whether it starts at rest."""
+    return [True, *(p.arrive is not Arrival.MOVING for p in scene.phases[:-1])]
+
+
+@computed_at_once
+def _bounds_of_numbers(scene: Scene, traced: tuple[TracedPhase, ...]) -> tuple[MarginBound, ...]:
+    starts_at_rest = _starts_at_rest(scene)
 
     def bound(path, phase, from_rest):
         if int(path.dynamics.status) != Status.OK:
@@ -86,7 +144,7 @@ def bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[Margi
         statics, accelerations = statics_at_start(scene, phase, path)
         return MarginBound(jnp.asarray(statics.best(accelerations).margin), path.dynamics.breakpoints[0], jnp.zeros(()))
 
-    return tuple(bound(*row) for row in zip(traced or trace(scene), scene.phases, starts_at_rest, strict=True))
+    return tuple(bound(*row) for row in zip(traced, scene.phases, starts_at_rest, strict=True))
 
 
 def require_knots(knots: int) -> None:

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from wholearm_jax.core import BackgroundTask, Status, compile_in_background, require_x64, wait_for
+from wholearm_jax.core import BackgroundTask, Status, compile_in_background, on_host, require_x64, wait_for
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.margin import affine_coefficients, best_quasistatic_torque
 from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, pad_schedule, replace_duration, round_up
@@ -57,6 +57,7 @@ class _Trial(NamedTuple):
     margin: float  # [N]; -inf if the object never moves
 
 
+@on_host("search outside of the transformation")
 def search_by_steps(scene: Scene, *, longest: float = 10.0, traced: tuple[TracedPhase, ...] = ()) -> SearchResult:
     """Search each phase's torques by steps of 10 % (the paper's section 3.1; derivation, section 10).
 

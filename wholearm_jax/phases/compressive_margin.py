@@ -5,11 +5,12 @@ from dataclasses import replace
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from wholearm_jax.core import is_traced
 from wholearm_jax.model import Arrival, Scene, TorqueSchedule
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.plan_schedule import has_torque_jumps, require_followable, with_plan_step_capacity
 from wholearm_jax.phases.plan_simulation import simulate_phases
-from wholearm_jax.phases.plan_tracing import trace
+from wholearm_jax.phases.plan_tracing import refuse_coarse_tables, trace
 from wholearm_jax.simulation import Adjoint, IntegratorOptions
 from wholearm_jax.tracing import Resolution
 
@@ -35,7 +36,8 @@ def margin(
         torque: Schedule that covers the plan.
         options: Integrator options. Jumps of the schedule within a phase are found where its times and the durations
             are numbers; where they are transformed, set `has_jumps`.
-        resolution: Sizes of the paths and their tables.
+        resolution: Sizes of the paths and their tables, to begin with. They grow as needed, except for a scene that is
+            an argument within `jit` or `vmap`: there an error says that they do not suffice.
 
     Returns:
         The margin [N]: negative where a contact would pull, `-inf` where a phase has no motion or no path. Whether the
@@ -54,7 +56,9 @@ def margin(
     options = replace(with_plan_step_capacity(options, scene, torque), has_jumps=jumps)
     if torque.times.dtype == jnp.float32:
         options = _coarsen(options)
-    return plan_margin(scene, simulate_phases(scene, torque, trace(scene, resolution=resolution), options))
+    traced = trace(scene, resolution=resolution)
+    value = plan_margin(scene, simulate_phases(scene, torque, traced, options))
+    return refuse_coarse_tables(value, traced, resolution) if is_traced(scene) else value
 
 
 def _coarsen(options: IntegratorOptions) -> IntegratorOptions:

@@ -18,6 +18,7 @@ from wholearm_jax.core import (
     as_device_array,
     compile_in_background,
     is_traced,
+    on_host,
     require_positive,
     require_x64,
     stack_trees,
@@ -36,6 +37,7 @@ from wholearm_jax.simulation import IntegratorOptions, tolerance_as_data
 MAX_SIMULATION_STEPS = 16384  # a phase, beyond which `simulate` does not try again
 
 
+@on_host("wholearm_jax.margin is the margin as a number that can be transformed")
 def simulate(
     scene: Scene,
     torque: TorqueSchedule,

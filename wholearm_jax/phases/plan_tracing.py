@@ -1,10 +1,15 @@
 """Tracing of a plan: every phase from where the one before it ended, refined until its tables are accurate."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core import Status, as_device_array, is_traced, stack_trees, unstack_trees
+from wholearm_jax.core import Status, as_device_array, computed_at_once, is_traced, stack_trees, unstack_trees
+from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.model import Arrival, Phase, Scene, rigid_body, scaled_mechanics
 from wholearm_jax.phases.phase_ends import target_configuration
 from wholearm_jax.phases.phase_tracing import TracedPhase, trace_phase, trace_phase_path
@@ -12,10 +17,17 @@ from wholearm_jax.tracing import ContactPath, Resolution
 
 TABLE_ROUNDING = 1e4  # in units of machine epsilon, interpolation error that more panels do not reduce
 MAX_PANELS = 512
+TABLE_TOL = 1e-9  # interpolation error of the tables, relative to each function's size
 MAX_SEGMENTS = 48
+COARSE_TABLES = (
+    "a table of this plan needs more panels or segments, which a program that is already compiled cannot add: "
+    "pass resolution=wholearm_jax.tracing.Resolution(segments=..., panels=...), larger than the default"
+)
 
 
-def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: float = 1e-9) -> tuple[TracedPhase, ...]:
+def trace(
+    scene: Scene, *, resolution: Resolution = Resolution(), tolerance: float = TABLE_TOL
+) -> tuple[TracedPhase, ...]:
     """Trace every phase of a plan and tabulate its path dynamics.
 
     This solves the paper's "set of C-functions equated to zero" along the whole path (derivation, section 3).
@@ -23,6 +35,7 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     Args:
         scene: Scene with its plan.
         resolution: Sizes to begin with. Panels are doubled, up to 512, until a table is accurate; segments likewise.
+            Within `jit` and `vmap` the sizes are fixed for a scene that is being transformed.
         tolerance: Interpolation error of the tables, relative to each function's size.
 
     Returns:
@@ -35,8 +48,71 @@ def trace(scene: Scene, *, resolution: Resolution = Resolution(), tolerance: flo
     >>> print(f"{float(traced[0].dynamics.length):.2f} object radii")
     1.33 object radii
     """
-    if is_traced(scene):  # shapes are fixed there: the caller has chosen the resolution
-        return unstack_trees(trace_in_one_program(scene, resolution), len(scene.phases))
+    if is_traced(scene):
+        return _trace_transformed(scene, resolution, tolerance)
+    return _trace_numbers(scene, resolution, tolerance)
+
+
+def _trace_transformed(scene: Scene, resolution: Resolution, tolerance: float) -> tuple[TracedPhase, ...]:
+    """Trace a plan that is being transformed, in one program.
+
+    Its sizes grow as in `_trace_refined` where its numbers are known, as under `grad`; within `jit` and `vmap` they are
+    as given.
+    """
+    while True:
+        traced = trace_in_one_program(scene, resolution)
+        sizes = jax.lax.stop_gradient(_table_sizes(traced.dynamics))
+        if is_traced(sizes):
+            break
+        full, coarse = map(np.asarray, insufficient(jax.device_get(sizes), resolution, tolerance))
+        refined = _refine(resolution, bool(full.any()), bool(coarse.any()))
+        if refined is None:
+            status = np.where(full | coarse, int(Status.NO_CONVERGENCE), sizes.status)
+            traced = eqx.tree_at(lambda t: t.dynamics.status, traced, as_device_array(status))
+        if refined in (None, resolution):
+            break
+        resolution = refined
+    return unstack_trees(traced, len(scene.phases))
+
+
+class TableSizes(NamedTuple):
+    """What tells whether a table's sizes suffice."""
+
+    count: Int[Array, ""]  # segments in use
+    error: Float[Array, ""]  # interpolation error, relative to each function's size
+    status: Int[Array, ""]
+
+
+def _table_sizes(dynamics: PathDynamics) -> TableSizes:
+    return TableSizes(dynamics.count, dynamics.error, dynamics.status)
+
+
+def insufficient(sizes: TableSizes, resolution: Resolution, tolerance: float):
+    """Say whether a path uses up its segments, and whether its table is less accurate than `tolerance`."""
+    error_floor = TABLE_ROUNDING * float(np.finfo(sizes.error.dtype).eps)
+    inaccurate = sizes.error > max(tolerance, error_floor)
+    return sizes.count >= resolution.segments, inaccurate & (sizes.status == int(Status.OK))
+
+
+def refuse_coarse_tables(values, traced: tuple[TracedPhase, ...], resolution: Resolution):
+    """Return `values`, or raise when the program runs and a table, whose sizes are fixed by then, does not suffice."""
+    sizes = [_table_sizes(phase.dynamics) for phase in traced]
+    bad = [full | coarse for full, coarse in (insufficient(one, resolution, TABLE_TOL) for one in sizes)]
+    return eqx.error_if(values, jnp.stack(bad).any(), COARSE_TABLES) if is_traced(bad) else values
+
+
+def _refine(resolution: Resolution, full: bool, coarse: bool) -> Resolution | None:
+    """Return the next larger resolution, the same where it suffices, None where there is none."""
+    if full and resolution.segments < MAX_SEGMENTS:
+        return resolution._replace(segments=2 * resolution.segments, panels=2 * resolution.panels)
+    if coarse and resolution.panels < MAX_PANELS:
+        return resolution._replace(panels=2 * resolution.panels)
+    return None if full or coarse else resolution
+
+
+@computed_at_once
+def _trace_numbers(scene: Scene, resolution: Resolution, tolerance: float) -> tuple[TracedPhase, ...]:
+    """Trace a plan phase by phase, each with its own sizes."""
     body, initial_guess, traced_phases = rigid_body(scene.object), scene.start, []
     for phase in scene.phases:
         begin = initial_guess, as_device_array(not traced_phases)
@@ -94,15 +170,10 @@ def _trace_refined(
     inputs, holds = (phase.formation, initial_guess, phase.target), as_device_array(phase.arrive is Arrival.HOLD)
     while True:
         traced = trace_phase(body, scene.hand, scene.gravity, *inputs, resolution, first, holds)
-        dynamics = traced.dynamics
-        error_floor = TABLE_ROUNDING * jnp.finfo(dynamics.breakpoints.dtype).eps
-        coarse = float(dynamics.error) > max(tolerance, error_floor) and int(dynamics.status) == Status.OK
-        full = int(dynamics.count) >= resolution.segments
-        if full and resolution.segments < MAX_SEGMENTS:
-            resolution = resolution._replace(segments=2 * resolution.segments, panels=2 * resolution.panels)
-        elif coarse and resolution.panels < MAX_PANELS:
-            resolution = resolution._replace(panels=2 * resolution.panels)
-        elif coarse or full:
+        full, coarse = insufficient(jax.device_get(_table_sizes(traced.dynamics)), resolution, tolerance)
+        refined = _refine(resolution, bool(full), bool(coarse))
+        if refined is None:
             return eqx.tree_at(lambda t: t.dynamics.status, traced, jnp.asarray(int(Status.NO_CONVERGENCE), int))
-        else:
+        if refined == resolution:
             return traced
+        resolution = refined

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core import CachedJit, Status, require_positive
+from wholearm_jax.core import CachedJit, Status, on_host, require_positive
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.margin import contact_force
 from wholearm_jax.model import Arrival, TorqueSchedule, interval, pad_schedule, restrict_to_phase, round_up, torque_at
@@ -69,6 +69,7 @@ def sample_phase(
     return Trajectory(start + duration * phase_times, *jax.vmap(one)(phase_times))
 
 
+@on_host("sample outside of the transformation")
 def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
     """Every phase at `samples` evenly spaced times; a phase that failed stops there, and later ones are left out.
 
