@@ -14,7 +14,14 @@ from wholearm_jax.core import Status, configure
 from wholearm_jax.ensembles import check
 from wholearm_jax.files import load, parse, read_torque, save, write_torque
 from wholearm_jax.model import Scene, TorqueSchedule, torque_schedule
-from wholearm_jax.optimisation import bounds, optimise, quasistatic, search_by_steps
+from wholearm_jax.optimisation import (
+    bounds,
+    convex_bounds,
+    optimise,
+    quasistatic,
+    search_by_steps,
+    shortest_motions,
+)
 from wholearm_jax.phases import margin, simulate, trace, trajectory
 from wholearm_jax.simulation import IntegratorOptions
 
@@ -26,6 +33,7 @@ __all__ = [
     "bounds",
     "check",
     "configure",
+    "convex_bounds",
     "load",
     "margin",
     "optimise",
@@ -34,6 +42,7 @@ __all__ = [
     "read_torque",
     "save",
     "search_by_steps",
+    "shortest_motions",
     "simulate",
     "torque_schedule",
     "trace",

@@ -67,7 +67,7 @@ def test_scenes(wholearm):
 def test_help_lists_the_commands(wholearm):
     code, out, _ = wholearm("--help")
     assert code == 0
-    for name in ("optimise", "simulate", "search", "report", "formations", "execute", "scenes"):
+    for name in ("optimise", "simulate", "search", "report", "formations", "execute", "scenes", "tradeoff"):
         assert f"  {name} " in out
 
 

@@ -24,6 +24,7 @@ from wholearm_jax.cli.report import report
 from wholearm_jax.cli.scenes import scenes
 from wholearm_jax.cli.search import search
 from wholearm_jax.cli.simulate import simulate
+from wholearm_jax.cli.tradeoff import tradeoff
 from wholearm_jax.core import DoubtfulInput, configure, discard_unreadable_entry, keep_compiled
 
 UsageError: Any = typer.BadParameter.__mro__[1]  # of the library beneath, which Typer has under changing names
@@ -46,7 +47,7 @@ def _options(
     """Dynamics and torque optimisation of planar whole-arm manipulation."""
 
 
-for command in (check, scenes, optimise, simulate, formations, search, report, execute):
+for command in (check, scenes, optimise, simulate, formations, search, tradeoff, report, execute):
     app.command()(command)
 
 

@@ -18,6 +18,7 @@ _MODULES = {
     "plot_strip": "pose_figures",
     "plot_successors": "pose_figures",
     "plot_torques": "plan_figures",
+    "plot_tradeoff": "tradeoff_figures",
     "save_figure": "style",
 }
 
