@@ -165,7 +165,7 @@ def _held_to(plan: dict[str, Any], coordinate: int, least: float) -> str | None:
         return None
     if not float(wa.bounds(scene, traced=traced)[-1].value) > LEAST_BOUND:
         return None
-    return describe_end(traced[-1], scene.phases[-1], scene.object.vertices.shape[0])
+    return describe_end(scene, scene.phases[-1], traced[-1])
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from wholearm_jax.margin.contact_forces import (
 )
 from wholearm_jax.margin.exact_margin import MAX_REFINED, MarginResult, minimum_margin
 from wholearm_jax.margin.path_optimum import PROGRAMME_INTERVALS, PathOptimum, largest_margin, shortest_duration
-from wholearm_jax.margin.path_programme import SpeedRange
+from wholearm_jax.margin.path_programme import SpeedRange, rest_to_rest
 from wholearm_jax.margin.quasistatic import (
     acceleration_terms,
     affine_coefficients,

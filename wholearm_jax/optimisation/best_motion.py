@@ -99,7 +99,7 @@ def shortest_motions(
         RuntimeError: without float64.
 
     >>> [f"{best.duration:.3f} s" for best in wa.shortest_motions(wa.load("heptagon"), 0.5)]
-    ['0.138 s', '0.138 s']
+    ['0.136 s', '0.142 s']
     """
 
     def solve(path, phase, speeds):
