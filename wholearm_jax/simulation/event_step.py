@@ -23,7 +23,7 @@ class EventStep(NamedTuple):
     s: Float[Array, ""]
     w: Float[Array, ""]
     at_stop: Bool[Array, ""]  # on `s_stop`; else at rest
-    failed: Bool[Array, ""]  # no length within the step ends on an event
+    failed: Bool[Array, ""]  # no event lies within the step's length of where it ends
 
 
 def step_to_event(
