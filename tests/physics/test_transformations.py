@@ -106,7 +106,6 @@ VALUES = {
     "checkpoint": jax.checkpoint,
 }
 GRADIENTS = {
-    "grad": jax.grad,
     "value_and_grad": lambda f: lambda x: jax.value_and_grad(f)(x)[1],
     "grad of checkpoint": lambda f: jax.grad(jax.checkpoint(f)),
     "grad of scan": lambda f: jax.grad(scanned(f)),
