@@ -61,7 +61,7 @@ def test_forces_show_the_margin_and_every_contact(pushed):
 
 
 def test_pose_numbers_its_vertices(pushed):
-    ax = plot_pose(pushed.scene, pushed.scene.start, numbers=True)
+    ax = plot_pose(pushed.scene, pushed.phases[0].traced.begin, numbers=True)
     assert [text.get_text() for text in ax.texts] == [str(k) for k in range(7)]
 
 

@@ -53,7 +53,8 @@ def formations(
     else:
         z, touching, title = loaded.start, touching_contacts(loaded, loaded.start, NEAR_TOL), "touching, or near"
         successors = successor_formations(loaded, z, rolling=True, touching=touching)
-    flush, overlaps = flush_sides(loaded, touching), describe_overlaps(loaded, z)
+    flush = flush_sides(loaded, touching)
+    overlaps = describe_overlaps(loaded, z) if loaded.phases or not successors else ()  # a rough start is projected
     for overlap in overlaps:
         note(f"{scene}: {overlap}: no phase can begin here")
     if as_json:

@@ -26,24 +26,40 @@ def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]], title:
         legend: lines below it.
     """
     from rich.console import Console
-    from rich.measure import Measurement
     from rich.table import Table
 
     width = terminal_width()
-    console = Console(width=width, highlight=False, markup=False, emoji=False)
-    table = Table()
-    for column in columns:
-        table.add_column(column.name, justify="right" if column.is_number else "left")
-    for row in rows:
-        table.add_row(*row)
-    if title:
-        print(textwrap.fill(title, width))
-    if rows and Measurement.get(console, console.options.update(max_width=10 * width), table).minimum <= width:
-        console.print(table)
-    else:
+    for line in title.splitlines():
+        print(textwrap.fill(line, width, subsequent_indent="  "))
+    widths = _column_widths(columns, rows, width)
+    if widths is None:
         _print_stacked(columns, rows, width)
+    else:
+        table = Table()
+        for column, fixed in zip(columns, widths, strict=True):
+            table.add_column(column.name, justify="right" if column.is_number else "left", width=fixed)
+        for row in rows:
+            table.add_row(*row)
+        Console(width=width, highlight=False, markup=False, emoji=False).print(table)
     for line in legend.splitlines():
         print(textwrap.fill(line, width, subsequent_indent="  "))
+
+
+def _column_widths(columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int) -> list[int] | None:
+    """Return the widths of columns that fit, the widest shrunk first; None if words or numbers would have to be cut."""
+    cells = list(zip(*rows, strict=True)) if rows else [()] * len(columns)
+    widths = [max(map(len, (column.name, *own))) for column, own in zip(columns, cells, strict=True)]
+    least = []
+    for column, own in zip(columns, cells, strict=True):
+        words = [word for text in (column.name, *own) for word in text.split()]
+        least.append(max(map(len, (*words, *(own if column.is_number else ()))), default=0))
+    available = width - 3 * len(columns) - 1  # borders and padding
+    if sum(least) > available:
+        return None
+    while sum(widths) > available:
+        widest = max(range(len(widths)), key=lambda k: widths[k] if widths[k] > least[k] else -1)
+        widths[widest] -= 1
+    return widths
 
 
 def _print_stacked(columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int) -> None:
