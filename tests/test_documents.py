@@ -11,7 +11,7 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.core import Status
-from wholearm_jax.files import scene_toml
+from wholearm_jax.files import scene_schema
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "wholearm_jax"
@@ -81,9 +81,9 @@ def test_every_status_has_a_row_that_agrees():
 def test_the_page_on_scene_files_has_every_key():
     rows = re.findall(r"^\| ((?:`[\w.]+`(?:, )?)+) \|", (DOCS / "scenes.md").read_text(), re.MULTILINE)
     keys = [key for row in rows for key in re.findall(r"`([\w.]+)`", row)]
-    models = scene_toml._Scene, scene_toml._Finger, scene_toml._Object, scene_toml._Phase
+    models = scene_schema.SceneTables, scene_schema.FingerTable, scene_schema._Object, scene_schema.PhaseTable
     known = [name for model in models for name in model.model_fields if name != "hand"]
-    assert sorted(keys) == sorted([*known, *(f"hand.{name}" for name in scene_toml._Hand.model_fields)])
+    assert sorted(keys) == sorted([*known, *(f"hand.{name}" for name in scene_schema._Hand.model_fields)])
 
 
 def test_sections_that_the_code_cites_exist():
