@@ -133,9 +133,9 @@ def successor_formations(
     require_x64(scene, z)
     contacts = touching_contacts(scene, z) if touching is None else touching
     successors = []
-    for names in _combinations(contacts, rolling):
+    for names in formation_names(contacts, rolling):
         formation = contact_formation(names)
-        tangent = _path_direction(scene, z, formation)
+        tangent = path_direction(scene, z, formation)
         if tangent is None:
             continue
         lists_failures = touching is None and not bool(np.any(formation.tangential))
@@ -147,7 +147,7 @@ def successor_formations(
     return tuple(sorted(successors, key=lambda successor: -successor.static))
 
 
-def _combinations(contacts: Sequence[str], rolling: bool) -> Iterator[tuple[str, ...]]:
+def formation_names(contacts: Sequence[str], rolling: bool) -> Iterator[tuple[str, ...]]:
     """Yield the combinations of contacts with four constraints: one for a sliding contact, two for a rolling one."""
     yield from itertools.combinations(contacts, 4)
     for count in range(1, MAX_ROLLING + 1) if rolling else ():
@@ -157,7 +157,7 @@ def _combinations(contacts: Sequence[str], rolling: bool) -> Iterator[tuple[str,
                 yield *(f"{name} rolling" for name in rolls), *slides
 
 
-def _path_direction(scene, z, formation):
+def path_direction(scene, z, formation):
     """Return the path's direction in the object's units, or None where the constraints do not fix one."""
     rows = np.asarray(_constraint_rows(scene, z, formation))
     _, values, right = np.linalg.svd(rows)

@@ -1,0 +1,70 @@
+"""The configuration in which an object rests on the palm with one edge down and both fingers are closed on it."""
+
+import numpy as np
+
+from wholearm_jax.model.scene import Hand, Polygon, rigid_body
+
+
+def resting_configuration(shape: Polygon, hand: Hand, edge: int, x: float) -> np.ndarray:
+    """Place an object at rest on an edge, and close each finger from outside until it touches.
+
+    Args:
+        shape: the object.
+        hand: the hand.
+        edge: the edge that lies on the palm, from vertex `edge` to the next.
+        x: the centre of mass's x [m].
+
+    Returns:
+        `z` (5,) in SI units.
+
+    Raises:
+        ValueError: if the object has no such edge, cannot lie on it, or a finger does not reach the object.
+    """
+    body = rigid_body(shape)
+    count = int(body.count)
+    corners = np.asarray(body.vertices)[:count]
+    if not 0 <= edge < count:
+        raise ValueError(f"e{edge}: the object has edges 0 to {count - 1}")
+    begin, end = corners[edge], corners[(edge + 1) % count]
+    phi = -np.arctan2(end[1] - begin[1], end[0] - begin[0])
+    turn = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]])
+    at = corners @ turn.T
+    height = -at[edge, 1]
+    if at[:, 1].min() < -height - 1e-9 * np.ptp(corners):
+        raise ValueError(f"e{edge}: the object cannot lie on this edge: another vertex is lower")
+    at = at + np.array([x, height])
+    angles = [_closing_angle(at, hand, finger) for finger in range(2)]
+    for finger, angle in enumerate(angles):
+        if angle is None:
+            raise ValueError(f"e{edge} at x = {x:.4g} m: finger{finger + 1} does not reach the object")
+    return np.array([x, height, phi, *angles], float)
+
+
+def _closing_angle(corners: np.ndarray, hand: Hand, finger: int) -> float | None:
+    """Return the joint angle at which a finger, closing from outside, first touches; None: it never does."""
+    joint, length, offset = (np.asarray(a)[finger] for a in (hand.joint, hand.length, hand.offset))
+    if finger == 1:  # mirrored, it closes as finger 1 does
+        corners, joint = corners[::-1] * [-1, 1], joint * [-1, 1]
+    away = corners - joint
+    distance = np.hypot(*away.T)
+    # A vertex on the contact edge.
+    reach = np.sqrt(np.maximum(distance**2 - offset**2, 0.0))
+    on_edge = (distance > abs(offset)) & (reach <= length)
+    angles = [
+        np.arctan2(y, x) - np.arcsin(offset / d) for (x, y), d in zip(away[on_edge], distance[on_edge], strict=True)
+    ]
+    # The tip on an edge of the object: its circle about the joint meets the edge's line.
+    radius, lead = np.hypot(length, offset), np.arctan2(offset, length)
+    for begin, end in zip(away, np.roll(away, -1, axis=0), strict=True):
+        along = end - begin
+        a, b, c = along @ along, 2 * begin @ along, begin @ begin - radius**2
+        if b**2 - 4 * a * c > 0:
+            for t in (-b + np.array([-1, 1]) * np.sqrt(b**2 - 4 * a * c)) / (2 * a):
+                if 0 < t < 1:
+                    point = begin + t * along
+                    angles.append(np.arctan2(point[1], point[0]) - lead)
+    closing = [angle for angle in angles if -np.pi / 2 < angle]
+    if not closing:
+        return None
+    first = float(min(closing))
+    return first if finger == 0 else np.pi - first

@@ -1,0 +1,145 @@
+"""Moves of the planner: paths of all formations that hold at a configuration, many of them in one program."""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from wholearm_jax.core import CachedJit, Status
+from wholearm_jax.dynamics import evaluate, locate_panel
+from wholearm_jax.margin import best_quasistatic_torque
+from wholearm_jax.model import (
+    COORDINATES,
+    ContactFormation,
+    Scene,
+    constraint_jacobian,
+    contact_formation,
+    path_target,
+    rigid_body,
+    scaled_mechanics,
+)
+from wholearm_jax.phases import trace_phase
+from wholearm_jax.planning.successors import MIN_PATH_LENGTH, WEDGING_CONDITION, formation_names, touching_contacts
+from wholearm_jax.tracing import Resolution
+
+MOVES_PER_CALL = 8  # paths that one call of the program traces; the last call is filled up
+PLACES = 33  # configurations of a path that are kept
+RESOLUTION = Resolution(panels=16)  # of the planner's tables: forces to three digits
+
+
+class Move(NamedTuple):
+    """A path of a formation from a configuration, in one direction."""
+
+    contacts: tuple[str, ...]
+    toward: str
+    length: float  # in the object's radii
+    places: np.ndarray  # (PLACES, 5): `z` (SI), evenly spaced along the path, start and end included
+    margins: np.ndarray  # (PLACES,): largest compressive margin [N] at rest at these places, moving on forward
+    end_reason: int  # a `PathEnd`
+    end_contact: int
+
+
+class _Paths(NamedTuple):
+    """What the program returns for each path."""
+
+    status: Int[Array, "moves"]
+    length: Float[Array, "moves"]
+    places: Float[Array, "moves places 5"]
+    margins: Float[Array, "moves places"]
+    end_reason: Int[Array, "moves"]
+    end_contact: Int[Array, "moves"]
+
+
+def moves_from(scene: Scene, z: Float[Array, "5"], touching: Sequence[str] | None = None) -> tuple[Move, ...]:
+    """Return all moves from a configuration: formations `2R + S = 4` of what touches, sliding and rolling, both ways.
+
+    Args:
+        scene: the hand and the object.
+        z: the configuration (5,), SI.
+        touching: the contacts to combine; those that touch at `z` unless given.
+    """
+    names = touching_contacts(scene, z) if touching is None else touching
+    combinations = tuple(formation_names(names, rolling=True))
+    chosen = [
+        (contacts, COORDINATES[int(np.argmax(np.abs(direction)))] + sign)
+        for contacts, direction in zip(combinations, _path_directions(scene, z, names, combinations), strict=True)
+        if direction is not None
+        for sign in "-+"
+    ]
+    moves = []
+    for first in range(0, len(chosen), MOVES_PER_CALL):
+        part = chosen[first : first + MOVES_PER_CALL]
+        paths = jax.device_get(_trace(scene, z, [*part, *part[:1] * (MOVES_PER_CALL - len(part))]))
+        for k, (contacts, toward) in enumerate(part):
+            row = jax.tree.map(lambda a, k=k: a[k], paths)
+            if row.status == Status.OK and row.length >= MIN_PATH_LENGTH:
+                ends = int(row.end_reason), int(row.end_contact)
+                moves.append(Move(contacts, toward, float(row.length), row.places, row.margins, *ends))
+    return tuple(moves)
+
+
+def _path_directions(scene: Scene, z, names: Sequence[str], combinations) -> list[np.ndarray | None]:
+    """Return the direction of each combination's path in the object's units; None where constraints depend."""
+    if not combinations:
+        return []
+    # The normal and the tangential row of each contact, as if all rolled.
+    capacity = 8 * -(-len(names) // 8)
+    padded = [*names, *names[:1] * (capacity - len(names))]
+    every = contact_formation([f"{name} rolling" for name in padded])
+    rows = np.asarray(_constraint_rows(rigid_body(scene.object), scene.hand, scene.gravity, every, jnp.asarray(z)))
+    row_of = {name: rows[2 * k : 2 * k + 2] for k, name in enumerate(names)}
+    stacked = np.stack(
+        [
+            np.concatenate([row_of[name.partition(" ")[0]][: 1 + name.endswith("rolling")] for name in contacts])
+            for contacts in combinations
+        ]
+    )
+    _, values, right = np.linalg.svd(stacked)
+    independent = values[:, -1] > WEDGING_CONDITION * values[:, 0]
+    return [right[k, 4] if independent[k] else None for k in range(len(combinations))]
+
+
+@CachedJit
+def _constraint_rows(body, hand, gravity, formation, z):
+    mechanics = scaled_mechanics(body, hand, gravity, formation)
+    return constraint_jacobian(mechanics.contacts, z / mechanics.configuration_unit)
+
+
+@functools.lru_cache(maxsize=4096)
+def _formation(contacts: tuple[str, ...]) -> ContactFormation:
+    return contact_formation(contacts)
+
+
+def _trace(scene: Scene, z, chosen) -> _Paths:
+    formations = jax.tree.map(lambda *rows: np.stack(rows), *(_formation(contacts) for contacts, _ in chosen))
+    targets = [path_target(toward) for _, toward in chosen]
+    stacked = jax.tree.map(lambda *rows: np.stack(rows), *targets)
+    as_arrays = functools.partial(jax.tree.map, jnp.asarray)
+    body = rigid_body(scene.object)
+    return _trace_moves(body, scene.hand, scene.gravity, as_arrays(formations), as_arrays(stacked), jnp.asarray(z))
+
+
+@CachedJit
+def _trace_moves(body, hand, gravity, formations, targets, z) -> _Paths:
+    """Trace and tabulate paths one after the other, and sample places and margins."""
+
+    def one(move):
+        formation, target = move
+        traced = trace_phase(body, hand, gravity, formation, z, target, RESOLUTION, False, True)
+        dynamics = traced.dynamics
+        s = dynamics.breakpoints[0] + dynamics.length * jnp.linspace(0.0, 1.0, PLACES)
+        segment = (s[:, None] >= dynamics.breakpoints[1:-1]).sum(1).clip(0, dynamics.count - 1)
+
+        def place(segment, s):
+            panel, xi = locate_panel(dynamics, segment, s)
+            return evaluate(dynamics.configuration, panel, xi)
+
+        margins = jax.vmap(lambda s: best_quasistatic_torque(dynamics, s).margin)(s)
+        reason, contact = traced.path.end_reason, traced.path.end_contact
+        return _Paths(dynamics.status, dynamics.length, jax.vmap(place)(segment, s), margins, reason, contact)
+
+    return jax.lax.map(one, (formations, targets))
