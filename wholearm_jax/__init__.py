@@ -23,6 +23,7 @@ from wholearm_jax.optimisation import (
     shortest_motions,
 )
 from wholearm_jax.phases import margin, simulate, trace, trajectory
+from wholearm_jax.planning import plan
 from wholearm_jax.simulation import IntegratorOptions
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "margin",
     "optimise",
     "parse",
+    "plan",
     "quasistatic",
     "read_torque",
     "save",

@@ -20,6 +20,7 @@ from wholearm_jax.cli.execute import execute
 from wholearm_jax.cli.formations import formations
 from wholearm_jax.cli.interruption import INTERRUPTED, exit_on_interrupt
 from wholearm_jax.cli.optimise import optimise
+from wholearm_jax.cli.plan import plan
 from wholearm_jax.cli.report import report
 from wholearm_jax.cli.scenes import scenes
 from wholearm_jax.cli.search import search
@@ -47,7 +48,7 @@ def _options(
     """Dynamics and torque optimisation of planar whole-arm manipulation."""
 
 
-for command in (check, scenes, optimise, simulate, formations, search, tradeoff, report, execute):
+for command in (check, scenes, plan, optimise, simulate, formations, search, tradeoff, report, execute):
     app.command()(command)
 
 

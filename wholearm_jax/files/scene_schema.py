@@ -102,6 +102,28 @@ class _Start(_Strict):
     theta2: Angle
 
 
+class RestTable(_Strict):
+    """A start at rest on an edge, with the fingers closed on the object."""
+
+    on: Annotated[str, Field(pattern=r"^e[0-9]+$")]
+    x: Finite = 0.0
+
+
+class GoalTable(_Strict):
+    """What `plan` is to reach: absolute coordinates, displacements `by`, tolerances; or an edge to rest `on`."""
+
+    x: Finite | None = None
+    y: Finite | None = None
+    phi: Angle | None = None
+    theta1: Angle | None = None
+    theta2: Angle | None = None
+    by: Annotated[dict[Coordinate, Finite], BeforeValidator(read_angles_by_coordinate)] = Field(default_factory=dict)
+    tolerance: Annotated[dict[Coordinate, Positive], BeforeValidator(read_angles_by_coordinate)] = Field(
+        default_factory=dict
+    )
+    on: Annotated[str, Field(pattern=r"^e[0-9]+$")] | None = None
+
+
 def _four_constraints(contacts: list[str]) -> list[str]:
     rows = [parse_contact(text) for text in contacts]
     if len(set(row[:3] for row in rows)) < len(rows):
@@ -158,6 +180,7 @@ class SceneTables(_Strict):
     hand: _Hand
     object: _Object
     start: _Start
+    goal: GoalTable | None = None
     phase: Annotated[list[PhaseTable], Field(min_length=1)]
 
     @model_validator(mode="after")

@@ -16,7 +16,7 @@ from pydantic import (
 
 from wholearm_jax.core import DoubtfulInput, SceneError, as_device_array, write_atomically
 from wholearm_jax.files.angles import doubtful_angles
-from wholearm_jax.files.scene_schema import FingerTable, SceneTables, explain_validation_error
+from wholearm_jax.files.scene_schema import FingerTable, GoalTable, RestTable, SceneTables, explain_validation_error
 from wholearm_jax.model import (
     COORDINATES,
     LINKS,
@@ -27,6 +27,7 @@ from wholearm_jax.model import (
     contact_formation,
     path_target,
     polygon,
+    resting_configuration,
 )
 
 ARRIVALS = {"rest": Arrival.AT_REST, "moving": Arrival.MOVING, "caught": Arrival.ANY_SPEED}
@@ -62,6 +63,32 @@ def load_start(name: str | Path) -> Scene:
     contacts = ["palm:v0", "palm:v1", "palm:v2", "finger1:v0"]  # which every polygon has
     placeholder = {"name": "none", "contacts": contacts, "toward": "x-", "duration": 1.0}
     return eqx.tree_at(lambda s: s.phases, parse(data | {"phase": [placeholder]}, str(name)), ())
+
+
+def load_goal(name: str | Path) -> dict[str, dict[str, float]] | None:
+    """Read the goal of a scene file: keyword arguments `goal`, `by` and `tolerance` of `plan`; None without one.
+
+    Raises:
+        SceneError: if it is not a valid goal.
+    """
+    data = _read_toml(name)
+    if "goal" not in data:
+        return None
+    try:
+        goal = GoalTable.model_validate(data["goal"])
+    except ValidationError as error:
+        raise SceneError(f"{name}: goal.{explain_validation_error(error)}") from None
+    values = {c: getattr(goal, c) for c in COORDINATES if getattr(goal, c) is not None}
+    if goal.on is not None:
+        if "phi" in values or "phi" in goal.by:
+            raise SceneError(f"{name}: goal.on: the edge fixes phi; leave phi out")
+        vertices = np.asarray(load_start(name).object.vertices)
+        edge, count = int(goal.on[1:]), len(data["object"]["vertices"])
+        if edge >= count:
+            raise SceneError(f"{name}: goal.on: the object has edges 0 to {count - 1}")
+        along = vertices[(edge + 1) % count] - vertices[edge]
+        values["phi"] = -float(np.arctan2(along[1], along[0]))
+    return {"goal": values, "by": dict(goal.by), "tolerance": dict(goal.tolerance)}
 
 
 def _read_toml(name: str | Path) -> dict[str, Any]:
@@ -104,12 +131,31 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
     Traceback (most recent call last):
     wholearm_jax.core.errors.SceneError: mine: object.mass: must be greater than 0, not -1.0
     """
+    rests = isinstance(data.get("start"), dict) and "on" in data["start"]
+    try:
+        rest = RestTable.model_validate(data["start"]) if rests else None
+    except ValidationError as error:
+        raise SceneError(f"{source}: start.{explain_validation_error(error)}") from None
+    if rest is not None:
+        data = data | {"start": dict.fromkeys(COORDINATES, 0.0)}
     try:
         checked = SceneTables.model_validate(data)
     except ValidationError as error:
         raise SceneError(f"{source}: {explain_validation_error(error)}") from None
     for doubt in doubtful_angles(data):
         warnings.warn(f"{source}: {doubt}", DoubtfulInput, stacklevel=2)
+    scene = _build(checked)
+    if rest is None:
+        return scene
+    try:
+        z = resting_configuration(scene.object, scene.hand, int(rest.on[1:]), rest.x)
+    except ValueError as error:
+        raise SceneError(f"{source}: start.on: {error}") from None
+    return eqx.tree_at(lambda s: s.start, scene, as_device_array(z))
+
+
+def _build(checked: SceneTables) -> Scene:
+    """Build the scene of tables that have been checked."""
     fingers = (checked.hand.finger1, checked.hand.finger2)
     shape, friction = checked.object, checked.object.friction
     each = friction if isinstance(friction, float) else [getattr(friction, link) for link in LINKS]

@@ -1,5 +1,6 @@
 """Which contact formation can come next."""
 
+from wholearm_jax.planning.search import plan
 from wholearm_jax.planning.successors import (
     Successor,
     exit_velocity,
@@ -12,6 +13,7 @@ __all__ = [
     "Successor",
     "exit_velocity",
     "flush_sides",
+    "plan",
     "successor_formations",
     "touching_contacts",
 ]

@@ -120,7 +120,7 @@ def plan(
         margin: least margin [N] that a plan must allow.
         count: number of plans to return at most.
         max_phases: longest plan.
-        time_limit: seconds after which the search ends with what it has.
+        time_limit: seconds of search, compiling left out, after which it ends with what it has.
         duration: of each phase [s].
         callback: called with the number of configurations expanded and the distance of the nearest.
 
@@ -156,6 +156,8 @@ def plan(
         out_of_time = time.monotonic() - begin > time_limit
         if len(steps) < max_phases and not out_of_time:
             _expand(search, z, steps, names)
+            if search.nodes == 1:  # the first expansion compiles: that is no time of the search
+                begin = time.monotonic()
         if callback is not None:
             callback(search.nodes, search.nearest[0])
     plans.sort(key=lambda one: (-round(one.bound, 6), len(one.steps)))
@@ -198,9 +200,9 @@ def _expand(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching) -
     moves = moves_from(search.scene, as_device_array(z), touching)
     search.nodes += 1
     search.moves += len(moves)
-    stopped = steps[-1].contacts if steps and steps[-1].until else None  # to go on along the same path is no new move
+    previous = steps[-1].contacts if steps else None
     for move in moves:
-        if move.contacts == stopped:
+        if move.contacts == previous:  # on or back along the same path: no new move
             continue
         for step, is_end in _stops(search, move):
             if step.margin > search.floor:

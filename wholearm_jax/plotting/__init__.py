@@ -13,6 +13,7 @@ _MODULES = {
     "plot_execution_strip": "execution_figures",
     "plot_forces": "plan_figures",
     "plot_history": "plan_figures",
+    "plot_plan_poses": "pose_figures",
     "plot_pose": "pose_figures",
     "plot_result": "plan_figures",
     "plot_strip": "pose_figures",

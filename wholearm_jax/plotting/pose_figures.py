@@ -105,6 +105,28 @@ def plot_successors(scene: Scene, z, successors, columns: int = 4, axes=None) ->
     return axes
 
 
+def plot_plan_poses(scene: Scene, begins, ends, axes=None) -> np.ndarray:
+    """Plot where each phase of a plan ends, with where it begins in grey; the start comes first.
+
+    Args:
+        scene: the plan.
+        begins: `z` (5,) at the start of each phase.
+        ends: `z` (5,) at the end of each phase.
+        axes: an array of axes, one more than phases; new ones unless given.
+
+    Returns:
+        The axes.
+    """
+    axes = pose_grid(axes, 1, len(ends) + 1, 1.15)
+    plot_pose(scene, begins[0], axes.flat[0], label="start", numbers=True)
+    for k, (ax, begin, end) in enumerate(zip(axes.flat[1:], begins, ends, strict=False)):
+        _plot_start_outline(scene, begin, ax)
+        contacts = scene.phases[k].formation.names
+        plot_pose(scene, end, ax, label=f"{k + 1}: {' '.join(contacts[:2])}\n{' '.join(contacts[2:])}")
+        ax.title.set_fontsize("x-small")
+    return axes
+
+
 def pose_grid(axes, rows: int, columns: int, ratio: float) -> np.ndarray:
     """Return `axes` as an array, or make new ones for poses; `ratio` is the height of each over its width."""
     if axes is not None:

@@ -1,0 +1,163 @@
+"""Plans from a start and a goal: traced anew, they arrive; where there is none, the reason is right."""
+
+import subprocess
+import sys
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tomli_w
+from shapely import LineString, Polygon
+
+import wholearm_jax as wa
+from wholearm_jax.files import load_goal, load_start
+from wholearm_jax.files.scene_toml import SceneError, to_dict
+from wholearm_jax.model import resting_configuration
+from wholearm_jax.planning.goal import make_goal
+from wholearm_jax.planning.moves import moves_from
+from wholearm_jax.planning.successors import successor_formations
+
+
+def part_data(name="heptagon"):
+    data = to_dict(wa.load(name))
+    data["hand"]["fingers"] = "coplanar"
+    for finger in ("finger1", "finger2"):
+        data["hand"][finger]["length"] = 0.13
+    return data
+
+
+@pytest.fixture(scope="module")
+def part():
+    """The heptagon at rest on an edge, on a hand whose fingers share a plane; no phases."""
+    scene = wa.parse(part_data())
+    z = resting_configuration(scene.object, scene.hand, 5, 0.02)
+    return eqx.tree_at(lambda s: (s.start, s.phases), scene, (jnp.asarray(z), ()))
+
+
+@pytest.fixture(scope="module")
+def turned(part):
+    return wa.plan(part, by={"phi": -0.35}, count=2)
+
+
+def test_plans_arrive_when_traced_anew(part, turned):
+    assert turned.found
+    assert turned.reason == ""
+    assert turned.plans[0].bound == max(one.bound for one in turned.plans)
+    for one in turned.plans:
+        traced = wa.trace(one.scene)
+        assert all(int(phase.dynamics.status) == wa.Status.OK for phase in traced)
+        assert float(traced[-1].end[2] - part.start[2]) == pytest.approx(-0.35, abs=np.radians(1))
+        np.testing.assert_allclose(one.bounds, [float(b.value) for b in wa.bounds(one.scene)], rtol=1e-9)
+        assert one.bound > 0
+
+
+def test_the_best_plan_can_be_optimised_as_it_is(turned):
+    optimum = wa.optimise(turned.plans[0].scene, knots=21)
+    assert optimum.result.status is wa.Status.OK
+    assert optimum.result.margin <= turned.plans[0].bound * (1 + 1e-9)
+
+
+def test_the_same_search_finds_the_same_plans(part, turned):
+    again = wa.plan(part, by={"phi": -0.35}, count=2)
+    assert [[step.contacts for step in one.steps] for one in again.plans] == [
+        [step.contacts for step in one.steps] for one in turned.plans
+    ]
+
+
+def test_moves_are_the_formations_that_can_follow(part):
+    """Both enumerations list the same paths, with the same ends."""
+    listed = {
+        (one.contacts, one.toward): np.asarray(one.end)
+        for one in successor_formations(part, part.start, rolling=True)
+        if one.status is wa.Status.OK
+    }
+    moves = {(one.contacts, one.toward): one.places[-1] for one in moves_from(part, part.start)}
+    assert moves.keys() == listed.keys()
+    for key, end in moves.items():
+        np.testing.assert_allclose(end, listed[key], atol=1e-8)
+
+
+def test_an_unreachable_goal_names_the_nearest_pose(part):
+    found = wa.plan(part, by={"x": 0.5}, max_phases=1)
+    assert not found.found
+    assert found.reason.startswith("no plan: all moves were tried; nearest: x is off by ")
+    assert found.nearest is not None
+    assert found.nearest.ends[-1][0] > float(part.start[0])
+
+
+def test_a_floor_for_the_margin_holds(part):
+    assert not wa.plan(part, by={"phi": -0.35}, margin=5.0, max_phases=2).found
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({}, "at least one coordinate"),
+        ({"goal": {"z": 1.0}}, "'z' is not a coordinate"),
+        ({"goal": {"x": 0.0}, "by": {"x": 0.1}}, "x is given twice"),
+        ({"goal": {"x": float("nan")}}, "must be finite"),
+        ({"goal": {"x": 0.0}, "tolerance": {"x": 0.0}}, "tolerances positive"),
+    ],
+)
+def test_goals_that_cannot_be_understood_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make_goal(np.zeros(5), **arguments)
+
+
+@pytest.mark.parametrize("name", ["heptagon", "hexagon"])
+@pytest.mark.parametrize("offset", [0.0, 0.004])
+def test_fingers_close_until_they_touch(name, offset):
+    """Against shapely: the contact edges touch the outline, and nothing lies inside."""
+    data = part_data(name)
+    for finger in ("finger1", "finger2"):
+        data["hand"][finger]["offset"] = offset
+    scene = wa.parse(data)
+    z = resting_configuration(scene.object, scene.hand, 5, 0.01)
+    corners = np.asarray(data["object"]["vertices"])
+    centre = np.asarray(Polygon(corners).centroid.coords[0])
+    turn = np.array([[np.cos(z[2]), -np.sin(z[2])], [np.sin(z[2]), np.cos(z[2])]])
+    outline = Polygon((corners - centre) @ turn.T + z[:2])
+    assert outline.bounds[1] == pytest.approx(0.0, abs=1e-12)
+    for finger, side in enumerate((1, -1)):
+        along = np.array([np.cos(z[3 + finger]), np.sin(z[3 + finger])])
+        base = np.asarray(scene.hand.joint[finger]) + side * offset * np.array([-along[1], along[0]])
+        edge = LineString([base, base + 0.13 * along])
+        assert edge.distance(outline) < 1e-12
+        assert edge.intersection(outline.buffer(-1e-9)).length == 0
+
+
+def write_scene(folder, **changes):
+    data = part_data()
+    data.pop("phase")
+    data["start"] = {"on": "e5", "x": 0.02}
+    path = folder / "part.toml"
+    path.write_text(tomli_w.dumps(data | changes))
+    return path
+
+
+def test_the_file_says_start_and_goal(tmp_path):
+    path = write_scene(tmp_path, goal={"by": {"x": -0.03, "phi": "-20 deg"}, "tolerance": {"x": 0.002}})
+    found = load_goal(path)
+    assert found == {"goal": {}, "by": {"x": -0.03, "phi": -np.radians(20)}, "tolerance": {"x": 0.002}}
+    start = load_start(path).start
+    np.testing.assert_allclose(start[:3], [0.02, 0.0373555, -0.2587709], atol=1e-6)
+    assert load_goal(write_scene(tmp_path)) is None
+    with pytest.raises(SceneError, match=r"start.on: e9: the object has edges 0 to 6"):
+        load_start(write_scene(tmp_path, start={"on": "e9"}))
+    with pytest.raises(SceneError, match=r"goal.z: unknown key"):
+        load_goal(write_scene(tmp_path, goal={"z": 1.0}))
+
+
+def test_the_command_writes_a_scene_that_optimise_takes(tmp_path):
+    path = write_scene(tmp_path)
+    command = [sys.executable, "-m", "wholearm_jax", "plan", str(path), "--by", "x=-0.03", "--count", "1"]
+    done = subprocess.run([*command, "--out", str(tmp_path / "out")], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    assert "bound" in done.stdout
+    planned = wa.load(tmp_path / "out" / "plan.toml")
+    assert len(planned.phases) == 1
+    assert (tmp_path / "out" / "plan.png").exists()
+    refused = subprocess.run([*command[:5], "--by", "q=1"], capture_output=True, text=True, timeout=600)
+    assert refused.returncode == 2
+    assert "write coordinates and values" in refused.stderr

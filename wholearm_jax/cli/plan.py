@@ -1,0 +1,150 @@
+"""`wholearm plan`: phases that lead from a start to a goal."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from wholearm_jax.cli.arguments import (
+    AsJson,
+    BadInput,
+    SceneName,
+    make_output_folder,
+    note,
+    refuse_unwritable,
+)
+from wholearm_jax.cli.tables import Column, print_json, print_table
+
+GOAL_HELP = 'Where the object is to be, such as "x=-0.03,phi=-40 deg" [m, rad]; instead of the scene\'s [goal].'
+COLUMNS = ("phase", "contacts", "toward", "until")
+NUMBERS = ("from x, y mm", "phi deg", "to x, y mm", "phi deg", "turn deg", "bound N")
+
+
+def plan(
+    scene: SceneName,
+    goal: Annotated[str | None, typer.Option(help=GOAL_HELP)] = None,
+    by: Annotated[str | None, typer.Option(help='The same, relative to the start, such as "x=-0.03".')] = None,
+    tolerance: Annotated[str | None, typer.Option(help='Such as "x=0.001,phi=1 deg", which is the default.')] = None,
+    margin: Annotated[float, typer.Option(help="Least margin of compressive force that a plan must allow [N].")] = 0.0,
+    count: Annotated[int, typer.Option(min=1, help="Number of plans at most.")] = 3,
+    phases: Annotated[int, typer.Option(min=1, help="Longest plan.")] = 5,
+    time: Annotated[float, typer.Option(min=0.0, help="Seconds after which the search ends with what it has.")] = 60.0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for plan.toml, further plans and pictures of their poses.")
+    ] = None,
+    optimise: Annotated[bool, typer.Option("--optimise", help="Go on to torques for the best plan.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Find phases that lead the object from a scene's start to a goal."""
+    from wholearm_jax.files import load_goal, load_start
+    from wholearm_jax.planning import plan as find_plans
+
+    loaded, folder = load_start(scene), make_output_folder(out)
+    wanted = _goal(scene, load_goal(scene), goal, by, tolerance)
+    try:
+        found = find_plans(loaded, **wanted, margin=margin, count=count, max_phases=phases, time_limit=time)
+    except ValueError as error:
+        raise BadInput(f"{scene}: {error}") from None
+    shown = found.plans or (() if found.nearest is None else (found.nearest,))
+    if as_json:
+        print_json({"reason": found.reason, "plans": [_json_plan(one) for one in found.plans]})
+    else:
+        for number, one in enumerate(shown, 1):
+            title = f"plan {number}: bound {one.bound:.3g} N" if found.found else "as near as it gets:"
+            print_table([*map(Column, COLUMNS), *(Column(name, True) for name in NUMBERS)], _rows(one), title)
+    if folder is not None:
+        _write(folder, found, shown)
+    if not found.found:
+        if not as_json:
+            note(f"{scene}: {found.reason}")
+        raise typer.Exit(1)
+    if optimise:
+        _optimise(found.plans[0], folder)
+
+
+def _goal(name: str, own: dict[str, Any] | None, goal, by, tolerance) -> dict[str, Any]:
+    """Return the goal's arguments: those of the command line, else the scene's."""
+    if goal is None and by is None:
+        if own is None:
+            raise BadInput(f"{name}: goal: missing; write a table [goal], or --goal or --by")
+        return own | ({"tolerance": _read(tolerance, "--tolerance")} if tolerance else {})
+    texts = {"goal": goal, "by": by, "tolerance": tolerance}
+    return {key: _read(text, f"--{key}") for key, text in texts.items() if text is not None}
+
+
+def _read(text: str, option: str) -> dict[str, float]:
+    """Read `x=-0.03,phi=-40 deg`."""
+    from wholearm_jax.files.angles import ANGLE_COORDINATES, read_angle
+    from wholearm_jax.model import COORDINATES
+
+    values = {}
+    for part in text.split(","):
+        name, _, value = (piece.strip() for piece in part.partition("="))
+        try:
+            number = float(value)
+        except ValueError:
+            try:
+                number = read_angle(value) if name in ANGLE_COORDINATES else math.nan
+            except ValueError:
+                number = math.nan
+        if name not in COORDINATES or not math.isfinite(number):
+            raise BadInput(f"{option} {text}: write coordinates and values such as x=-0.03,phi=-40 deg")
+        values[name] = number
+    return values
+
+
+def _json_plan(one) -> dict[str, Any]:
+    """Return a plan in SI units."""
+    rows = zip(one.steps, one.begins, one.ends, one.bounds, one.reasons, strict=True)
+    return {
+        "bound": one.bound,
+        "phases": [
+            {
+                "contacts": step.contacts,
+                "toward": step.toward,
+                "until": dict([step.until]) if step.until else None,
+                "begin": begin.tolist(),
+                "end": end.tolist(),
+                "turn_degrees": math.degrees(end[2] - begin[2]),
+                "bound": bound,
+                "ends": reason,
+            }
+            for step, begin, end, bound, reason in rows
+        ],
+    }
+
+
+def _rows(one) -> list[tuple[str, ...]]:
+    """Return the cells of a plan's table."""
+    rows = []
+    for k, (step, begin, end, bound) in enumerate(zip(one.steps, one.begins, one.ends, one.bounds, strict=True)):
+        poses = [
+            text for z in (begin, end) for text in (f"{1e3 * z[0]:.1f}, {1e3 * z[1]:.1f}", f"{math.degrees(z[2]):.1f}")
+        ]
+        until = one.reasons[k] if step.until is None else f"{step.until[0]} = {step.until[1]:.4g}"
+        turn = f"{math.degrees(end[2] - begin[2]):.1f}"
+        rows.append((str(k + 1), " ".join(step.contacts), step.toward, until, *poses, turn, f"{bound:.3g}"))
+    return rows
+
+
+def _write(folder: Path, found, shown) -> None:
+    """Write each plan as a scene, and a strip of its poses."""
+    from wholearm_jax.files import save
+    from wholearm_jax.plotting import plot_plan_poses, save_figure
+
+    with refuse_unwritable(f"--out {folder}"):
+        for number, one in enumerate(shown):
+            name = "nearest" if not found.found else "plan" if number == 0 else f"plan{number + 1}"
+            save(one.scene, folder / f"{name}.toml")
+            save_figure(lambda one=one: plot_plan_poses(one.scene, one.begins, one.ends), folder, name)
+
+
+def _optimise(best, folder: Path | None) -> None:
+    """Optimise the best plan, and say what became of it."""
+    from wholearm_jax.cli.output import write_and_exit
+    from wholearm_jax.optimisation import optimise
+
+    optimum = optimise(best.scene)
+    values = tuple(float(bound.value) for bound in optimum.bounds)
+    write_and_exit(optimum.result, folder, 201, False, bounds=values, command="optimise")
