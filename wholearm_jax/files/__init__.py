@@ -12,7 +12,7 @@ from wholearm_jax.files.results import (
     write_trajectory,
 )
 from wholearm_jax.files.scene_schema import Positive, explain_validation_error
-from wholearm_jax.files.scene_toml import bundled, load, load_start, parse, save, to_dict
+from wholearm_jax.files.scene_toml import bundled, load, load_goal, load_start, parse, save, to_dict
 from wholearm_jax.files.torque_csv import read_torque
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "explain_validation_error",
     "is_ok",
     "load",
+    "load_goal",
     "load_start",
     "null_for_undefined",
     "parse",
