@@ -30,6 +30,7 @@ import matplotlib.pyplot as plt
 import measure
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
+from layered_scenes import layered, layered_file
 
 import wholearm_jax as wa
 from wholearm_jax.ensembles import BLOCK, COARSE_PASS, check_scene, make_ensemble
@@ -104,7 +105,7 @@ def scaling(ensemble, torque) -> dict:
 
 def same_geometry(torque) -> dict:
     """Checks of objects that differ in friction and mass alone: their wires are one another's."""
-    ensemble = make_ensemble(wa.load("heptagon"), {"mass": "5%", "friction": "10%"}, seed=1)
+    ensemble = make_ensemble(layered("heptagon"), {"mass": "5%", "friction": "10%"}, seed=1)
     wa.check(ensemble, torque, count=BLOCK, arrival=ARRIVAL)
     begun = time.perf_counter()
     wa.check(ensemble, torque, count=ALIKE, arrival=ARRIVAL)
@@ -115,7 +116,7 @@ def same_geometry(torque) -> dict:
 
 def one_phase(torque) -> dict:
     """Checks of the first phase alone, a second of motion."""
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     ensemble = make_ensemble(replace(scene, phases=scene.phases[:1]), VARIED, seed=1)
     wa.check(ensemble, torque, count=BLOCK, arrival=ARRIVAL)
     begun = time.perf_counter()
@@ -250,7 +251,13 @@ def processes(number: int, folder: Path, torque: Path, count: int, chunk: int) -
     """The rate of a store's growth by `number` processes, after each has written its first chunk."""
     out = folder / f"{number}.zarr"
     varied = [f"--vary={name}={amount}" for name, amount in VARIED.items()]
-    line = [sys.executable, "-c", "from wholearm_jax.cli.app import main; main()", "check", "heptagon"]
+    line = [
+        sys.executable,
+        "-c",
+        "from wholearm_jax.cli.app import main; main()",
+        "check",
+        str(layered_file("heptagon")),
+    ]
     line += ["--torque", str(torque), *varied, "--count", str(count), "--chunk", str(chunk), "--out", str(out)]
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder / "programs"), "MPLBACKEND": "agg"}
     joined = ["--coordinator", "127.0.0.1:47113", "--processes", str(number), "--process"]
@@ -330,7 +337,7 @@ def main() -> None:
     wa.configure(compiled=given.compiled or "well")
     jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are to be fresh
-    ensemble, file = make_ensemble(wa.load("heptagon"), VARIED, seed=1), HERE / "data" / "heptagon_knots.csv"
+    ensemble, file = make_ensemble(layered("heptagon"), VARIED, seed=1), HERE / "data" / "heptagon_knots.csv"
     torque = wa.read_torque(file)
     if given.compiled:
         print(json.dumps(first_and_rate(ensemble, torque)))

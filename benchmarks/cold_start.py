@@ -22,11 +22,12 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import measure
+from layered_scenes import layered_file
 
 COMMANDS = {
-    "optimise": ("optimise", "heptagon"),
-    "search": ("search", "heptagon"),
-    "simulate": ("simulate", "heptagon"),
+    "optimise": ("optimise", str(layered_file("heptagon"))),
+    "search": ("search", str(layered_file("heptagon"))),
+    "simulate": ("simulate", str(layered_file("heptagon"))),
 }
 PLAIN = "--xla_cpu_use_fusion_emitters=true"
 PARTS = ("import", "trace", "lower", "compile", "read kept programs")

@@ -23,6 +23,7 @@ follows from the first guess, and moves on while the optimum lies at the interva
 import argparse
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -30,6 +31,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from layered_scenes import layered_file
 from scipy.special import beta, betainc
 
 import wholearm_jax as wa
@@ -528,7 +530,12 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=1.0, help="of every phase [s]")
     parser.add_argument("--knots", type=int, default=KNOTS, help="torques a joint")
     parser.add_argument("--best", action="store_true", help="the best that is known with finer intervals, slowly")
-    parser.add_argument("scenes", nargs="*", default=["heptagon", "hexagon"], help="bundled scenes or files")
+    parser.add_argument(
+        "scenes",
+        nargs="*",
+        default=[layered_file("heptagon"), layered_file("hexagon")],
+        help="bundled scenes or files",
+    )
     chosen = parser.parse_args()
     print("scene        phase          IPOPT  simulated  bound [N]  status          missed  iter  build  solve [s]")
     for name in chosen.scenes:
@@ -542,7 +549,7 @@ def main() -> None:
             forces = f"{one.course.least:7.4f} {one.margin:10.4f} {float(top.value):10.4f}"
             cost = f"{one.iterations:5d} {one.build:6.2f} {one.solve:6.2f}"
             failed = "" if one.ipopt in CONVERGED else f"  {one.ipopt}"
-            name = str(name)[-12:]
+            name = Path(name).stem.removesuffix("_layered")[-12:]
             print(
                 f"{name:12s} {phase.name:12s} {forces}  {one.assessment:14s} {one.missed:7.0e} {cost}{failed}",
                 flush=True,

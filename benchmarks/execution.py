@@ -12,6 +12,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from layered_scenes import layered
 from measure import RESULTS, save
 
 import wholearm_jax as wa
@@ -80,7 +81,7 @@ def main() -> None:
     quick = parser.parse_args().quick
     found = {}
     for scene in SCENES:
-        prediction = wa.simulate(wa.load(scene), wa.read_torque(DATA / f"{scene}_torque.csv"))
+        prediction = wa.simulate(layered(scene), wa.read_torque(DATA / f"{scene}_torque.csv"))
         found[scene] = study(prediction, quick=quick)
         for name, rows in found[scene].items():
             print(f"{scene}: {name} [s], worst [mm], end [mm], end [rad]")

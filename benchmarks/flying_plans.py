@@ -16,6 +16,7 @@ from pathlib import Path
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from layered_scenes import layered
 from random_plans import _grasps, random_object, write
 
 import wholearm_jax as wa
@@ -33,7 +34,7 @@ def flying_plans(count: int, seed: int = 0, *, phases: int = 3, pace: float = 0.
 
 def plans(rng: np.random.Generator, phases: int, pace: float) -> Iterator[wa.Scene]:
     """One plan after another, without end."""
-    hand = to_dict(wa.load("heptagon"))["hand"]
+    hand = to_dict(layered("heptagon"))["hand"]
     for number in itertools.count():
         shape = random_object(rng)
         found = (plan for grasp in _grasps(rng, shape["vertices"], hand) for plan in _from(grasp, shape, hand, phases))

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import measure
 import numpy as np
+from layered_scenes import layered
 
 import wholearm_jax as wa
 from wholearm_jax.margin import minimum_margin
@@ -182,7 +183,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one phase, fewer knots and tolerances; saves nothing")
     quick = parser.parse_args().quick
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are to be fresh
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     traced, found = wa.trace(scene), {}
     for phase in (1,) if quick else (0, 1):
         dynamics = traced[phase].dynamics

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import measure
 import numpy as np
 from collocation import CONVERGED, Collocated, best_known, collocate
+from layered_scenes import layered
 from matplotlib import pyplot as plt
 from random_plans import random_plans
 
@@ -114,7 +115,7 @@ def main() -> None:
 def _plans(quick: bool):
     """Name, scene and durations of every plan."""
     for name in ("heptagon", "hexagon"):
-        yield name, wa.load(name), BUNDLED[:1] if quick else BUNDLED
+        yield name, layered(name), BUNDLED[:1] if quick else BUNDLED
     for number, scene in enumerate(random_plans(4 if quick else PLANS, SEED)):
         yield f"random {number}", scene, RANDOM[:1] if quick else RANDOM
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from layered_scenes import layered
 
 import wholearm_jax as wa
 from wholearm_jax.files import to_dict
@@ -47,7 +48,7 @@ def write(scenes: tuple[wa.Scene, ...], folder: Path) -> None:
 
 def plans(rng: np.random.Generator, phases: int, duration: float) -> Iterator[wa.Scene]:
     """One plan after another, without end."""
-    hand = to_dict(wa.load("heptagon"))["hand"]
+    hand = to_dict(layered("heptagon"))["hand"]
     for number in itertools.count():
         shape = random_object(rng)
         for start, contacts in _grasps(rng, shape["vertices"], hand):

@@ -38,6 +38,7 @@ import measure
 import newton_in_field
 import numba_loop
 import numpy as np
+from layered_scenes import layered
 
 import wholearm_jax as wa
 from wholearm_jax.core import CachedJit, Status
@@ -107,7 +108,7 @@ class Problem:
 
 def problems(*, referred: bool) -> list[Problem]:
     """The four; without their references (minutes of work) where only times are wanted."""
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     traced = wa.trace(scene)
     kinds = ("knots", "ramps")
     return [_problem(scene, traced, p, kind, referred) for p, kind in itertools.product((0, 1), kinds)]

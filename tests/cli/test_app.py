@@ -58,8 +58,8 @@ def test_scenes(wholearm):
     code, out, err = wholearm("scenes")
     assert code == 0
     rows = out.splitlines()
-    assert "heptagon: irregular heptagon; slide left, flip right" in rows
-    assert "hexagon: hexagon; slide left, flip right" in rows
+    assert "heptagon: irregular heptagon; slide right, flip right" in rows
+    assert "hexagon: hexagon; slide right, flip right" in rows
     assert [row.partition(":")[0] for row in rows] == list(bundled())
     assert err == ""
 

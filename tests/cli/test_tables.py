@@ -48,7 +48,7 @@ def test_scenes_as_json(wholearm):
     assert rows["heptagon"] == {
         "name": "heptagon",
         "title": "irregular heptagon",
-        "phases": ["slide left", "flip right"],
+        "phases": ["slide right", "flip right"],
     }
 
 

@@ -3,10 +3,11 @@
 import json
 
 import numpy as np
+from support import layered_file
 
 
 def test_less_margin_takes_less_time(wholearm, tmp_path):
-    code, out, err = wholearm("tradeoff", "hexagon", "--json", "--out", tmp_path)
+    code, out, err = wholearm("tradeoff", layered_file("hexagon"), "--json", "--out", tmp_path)
     assert (code, err) == (0, "")
     answer = json.loads(out)
     rows = answer["tradeoff"]
@@ -22,7 +23,7 @@ def test_less_margin_takes_less_time(wholearm, tmp_path):
 
 
 def test_the_table_has_a_row_a_margin(wholearm):
-    code, out, _ = wholearm("tradeoff", "hexagon")
+    code, out, _ = wholearm("tradeoff", layered_file("hexagon"))
     assert code == 0
     assert "shortest durations" in out
     assert "total s" in out

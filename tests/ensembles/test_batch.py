@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import layered
+from support import layered, layered_file
 
 import wholearm_jax as wa
 from wholearm_jax.cli import app as command
@@ -338,7 +338,16 @@ def test_bad_input_of_the_command(tmp_path, monkeypatch, capsys, arguments, said
     monkeypatch.setenv("XLA_FLAGS", "")
     torque = tmp_path / "zero.csv"
     torque.write_text("t,tau1,tau2\n0,0,0\n2,0,0\n")
-    line = ["wholearm", "check", "heptagon", "--torque", str(torque), "--out", str(tmp_path / "r.zarr"), *arguments]
+    line = [
+        "wholearm",
+        "check",
+        str(layered_file("heptagon")),
+        "--torque",
+        str(torque),
+        "--out",
+        str(tmp_path / "r.zarr"),
+        *arguments,
+    ]
     monkeypatch.setattr(sys, "argv", line)
     with pytest.raises(SystemExit) as caught:
         command.main()

@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from support import layered_file
 
 from wholearm_jax.core.errors import StoreError
 from wholearm_jax.ensembles.scene_check import BatchResult
@@ -28,7 +29,17 @@ def command():
     varied = ["--vary", "vertices=0.0002", "--vary", "friction=10%", "--count", str(COUNT), "--chunk", str(CHUNK)]
     settings = ["--seed", "3", "--arrival", "0.02"]
     run = "from wholearm_jax.cli.app import main; main()"
-    return [sys.executable, "-c", run, "check", "heptagon", "--torque", str(torque), *varied, *settings]
+    return [
+        sys.executable,
+        "-c",
+        run,
+        "check",
+        str(layered_file("heptagon")),
+        "--torque",
+        str(torque),
+        *varied,
+        *settings,
+    ]
 
 
 def start(command, store: Path, *more: str, devices: int = 1) -> subprocess.Popen:

@@ -5,6 +5,7 @@ import math
 import warnings
 
 import pytest
+from support import layered_file
 
 import wholearm_jax as wa
 from wholearm_jax.core.errors import DoubtfulInput, SceneError
@@ -126,7 +127,7 @@ def test_the_case_in_degrees_is_noted(wholearm, request):
 def changed(*changes):
     from wholearm_jax.cli.arguments import load_scene
 
-    return load_scene("heptagon", list(changes))
+    return load_scene(layered_file("heptagon"), list(changes))
 
 
 def test_set_takes_angles(capsys):
@@ -152,7 +153,7 @@ BAD_CHANGES = {
 
 @pytest.mark.parametrize(("change", "cause"), BAD_CHANGES.items())
 def test_bad_changes_of_angles(change, cause, wholearm):
-    status, out, errors = wholearm("simulate", "heptagon", "--torque", "none.csv", "--set", change)
+    status, out, errors = wholearm("simulate", layered_file("heptagon"), "--torque", "none.csv", "--set", change)
     assert (status, out) == (2, "")
     assert errors.startswith(f"wholearm: --set {change}: ")
     assert cause in errors

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 import tomli_w
+from support import layered
 
 from wholearm_jax.core.errors import SceneError
 from wholearm_jax.files.scene_toml import bundled, load, parse, save, to_dict
@@ -354,7 +355,7 @@ def test_parse_names_its_source():
 
 
 def test_a_phase_without_a_heading_is_not_written():
-    scene = load("heptagon")
+    scene = layered("heptagon")
     scene = eqx.tree_at(lambda s: s.phases[0].target, scene, path_target(None))
     with pytest.raises(ValueError, match="'slide left' does not say which way"):
         to_dict(scene)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 import pytest
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.model import Arrival, replace_duration
@@ -18,7 +19,7 @@ def lasting(scene, seconds):
 @pytest.mark.parametrize("seconds", [1.0, 0.15])
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])
 def test_no_schedule_reaches_more(name, seconds):
-    scene = lasting(wa.load(name), seconds)
+    scene = lasting(layered(name), seconds)
     traced = wa.trace(scene)
     best = wa.convex_bounds(scene, traced=traced)
     optimum = wa.optimise(scene, traced=traced)
@@ -30,7 +31,7 @@ def test_no_schedule_reaches_more(name, seconds):
 
 def test_a_best_motion_is_consistent():
     """Its forces keep the margin, its torques are within limits, its times and speeds fit."""
-    scene = lasting(wa.load("hexagon"), 0.15)
+    scene = lasting(layered("hexagon"), 0.15)
     for best, phase, path in zip(wa.convex_bounds(scene), scene.phases, wa.trace(scene), strict=True):
         assert best.feasible
         assert best.force.min() >= best.margin - 1e-6
@@ -48,26 +49,26 @@ def test_a_best_motion_is_consistent():
 
 
 def test_more_time_is_worth_what_the_multiplier_says():
-    scene = wa.load("hexagon")
+    scene = layered("hexagon")
     short, middle, long = (wa.convex_bounds(lasting(scene, t))[0] for t in (0.1499, 0.15, 0.1501))
     assert (long.margin - short.margin) / 0.0002 == pytest.approx(middle.time_gain, rel=1e-3)
 
 
 def test_the_shortest_time_with_the_largest_margin_is_the_time_allowed():
-    scene = lasting(wa.load("hexagon"), 0.15)
+    scene = lasting(layered("hexagon"), 0.15)
     best = wa.convex_bounds(scene)[0]
     fastest = wa.shortest_motions(scene, best.margin)[0]
     assert fastest.duration == pytest.approx(0.15, rel=1e-6)
 
 
 def test_margins_that_no_motion_has_are_refused():
-    scene = wa.load("heptagon")
+    scene = layered("heptagon")
     assert not any(best.feasible for best in wa.shortest_motions(scene, 5.0))
     assert not any(best.feasible for best in wa.convex_bounds(lasting(scene, 0.01)))
 
 
 def test_a_phase_that_may_end_at_any_speed_has_at_least_the_margin():
-    scene = lasting(wa.load("hexagon"), 0.15)
+    scene = lasting(layered("hexagon"), 0.15)
     caught = eqx.tree_at(
         lambda s: s.phases, scene, (replace(scene.phases[0], arrive=Arrival.ANY_SPEED), scene.phases[1])
     )

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
-from support import layered
+from support import layered, layered_file
 
 import wholearm_jax as wa
 from wholearm_jax.files.torque_csv import read_torque
@@ -56,5 +56,5 @@ def test_a_schedule_much_longer_than_its_plan_is_noted(last, noted):
 def test_the_case_in_milliseconds(wholearm):
     path = Path(__file__).parents[1] / "data" / "cases" / "torque_ms.csv"
     assert "in milliseconds?" in note_on_length(layered("heptagon"), read_torque(path))
-    _, _, errors = wholearm("simulate", "heptagon", "--torque", path)
+    _, _, errors = wholearm("simulate", layered_file("heptagon"), "--torque", path)
     assert f"note: {path}: the torque schedule goes on to 2000 s" in errors

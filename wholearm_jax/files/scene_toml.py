@@ -47,7 +47,7 @@ def load(name: str | Path) -> Scene:
 
     >>> scene = wa.load("heptagon")
     >>> [phase.name for phase in scene.phases]
-    ['slide left', 'flip right']
+    ['slide right', 'flip right']
     >>> wa.load("heptagn")
     Traceback (most recent call last):
     wholearm_jax.core.errors.SceneError: heptagn: no such file; did you mean the bundled scene 'heptagon'?

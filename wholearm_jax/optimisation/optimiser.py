@@ -127,7 +127,7 @@ def optimise(
 
     >>> optimum = wa.optimise(wa.load("heptagon"))
     >>> optimum.result.status.label, [f"{fraction:.2f}" for fraction in optimum.bound_fraction]
-    ('ok', ['1.00', '1.00'])
+    ('ok', ['1.00', '0.95'])
     """
     require_x64(scene)
     require_knots(knots)

@@ -103,7 +103,7 @@ def bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[Margi
         RuntimeError: without float64.
 
     >>> [f"{float(bound.value):.3f} N" for bound in wa.bounds(wa.load("heptagon"))]
-    ['0.966 N', '0.838 N']
+    ['0.417 N', '2.575 N']
     """
     require_x64(scene)
     if is_traced(scene, traced):

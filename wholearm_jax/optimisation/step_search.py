@@ -73,7 +73,7 @@ def search_by_steps(scene: Scene, *, longest: float = 10.0, traced: tuple[Traced
         RuntimeError: without float64.
         ValueError: for a plan with a phase that holds the object.
 
-    >>> search = wa.search_by_steps(wa.load("hexagon"))
+    >>> search = wa.search_by_steps(wa.load("heptagon"))
     >>> search.result.status.label, search.torque.values.shape
     ('ok', (4, 2))
     """

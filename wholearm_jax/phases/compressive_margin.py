@@ -49,7 +49,7 @@ def margin(
 
     >>> scene = wa.load("heptagon")
     >>> print(f"{float(wa.margin(scene, wa.quasistatic(scene))):.2f} N")
-    0.70 N
+    0.41 N
     """
     require_followable(torque)
     jumps = options.has_jumps or has_torque_jumps(scene, torque)

@@ -72,7 +72,7 @@ def simulate(
     >>> result.status.label, result.phases[0].status.label
     ('stuck', 'stuck')
     >>> print(result.message.rpartition(":")[0])
-    slide left: stuck, t = 1 s, at rest since 0 s
+    slide right: stuck, t = 1 s, at rest since 0 s
     """
     require_x64(scene, torque)
     require_positive(tolerance=tolerance, max_steps=max_steps, arrival=arrival)

@@ -46,7 +46,7 @@ def trace(
     >>> [wa.Status(int(phase.dynamics.status)).label for phase in traced]
     ['ok', 'ok']
     >>> print(f"{float(traced[0].dynamics.length):.2f} object radii")
-    1.33 object radii
+    0.50 object radii
     """
     if is_traced(scene):
         return _trace_transformed(scene, resolution, tolerance)
