@@ -63,6 +63,7 @@ def test_links_and_object_do_not_overlap(optimum, tmp_path):
 def test_executions_end_where_predicted(optimum):
     _, found = optimum
     done = execute(found.result, timestep=2e-4)
+    assert done.link_contacts == {}
     assert done.position_error < 5e-5
     assert abs(done.angle_error) < 1e-3
 

@@ -92,8 +92,8 @@ def test_free_fall_and_free_fingers(predictions):
     """Away from everything the object falls by g t^2 / 2 and a finger obeys J theta'' = tau - B theta' - D."""
     scene, step, count = predictions["heptagon"].scene, 1e-4, 1000
     start, torque = np.array([0.0, 1.0, 0.3, 1.0, 2.0]), np.array([0.2, -0.3])
-    course, creep = run_schedule(build_mujoco_model(scene, step), scene, start, np.tile(torque, (count, 1)), step)
-    assert creep == 0.0
+    course, creep, met = run_schedule(build_mujoco_model(scene, step), scene, start, np.tile(torque, (count, 1)), step)
+    assert (creep, met) == (0.0, {})
     t = count * step
     np.testing.assert_allclose(course.z[-1, :3], [0, 1 - 9.81 * t * (t + step) / 2, 0.3], rtol=1e-12, atol=1e-12)
     hand = scene.hand
@@ -110,7 +110,7 @@ def test_every_link_and_joint_has_its_own_friction(predictions):
         lambda s: (s.object.friction, s.hand.dry, s.hand.viscous), scene, tuple(map(jnp.asarray, (mu, dry, viscous)))
     )
     bodies = build_mujoco_model(scene, 1e-4)
-    assert bodies.model.npair == len(bodies.names)
+    assert bodies.model.npair == len(bodies.names) + len(bodies.link_meetings)
     for name in bodies.names:
         assert list(bodies.model.pair(name).friction[:2]) == [mu[parse_contact(name)[0]]] * 2
     np.testing.assert_array_equal(np.ravel(bodies.model.dof_frictionloss), [0, 0, 0, *dry])
@@ -395,7 +395,7 @@ def test_an_end_is_judged_by_place_angle_and_contacts(off, ending, predictions):
 @pytest.mark.parametrize(("creep", "why"), [(np.inf, "MuJoCo gave up"), (6e-4, "contacts crept 0.6 mm")])
 def test_a_simulation_that_diverges_is_said(creep, why, predictions, monkeypatch):
     honest = execution.run_schedule
-    monkeypatch.setattr(execution, "run_schedule", lambda *a: (honest(*a)[0], creep))
+    monkeypatch.setattr(execution, "run_schedule", lambda *a: (honest(*a)[0], creep, {}))
     done = execute(predictions["heptagon"], timestep=1e-3)
     assert done.ending is ExecutionOutcome.DIVERGED
     assert done.message.startswith(f"diverged ({why}: take a shorter time step), ")

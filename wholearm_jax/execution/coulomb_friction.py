@@ -81,6 +81,9 @@ def _touching(
     touching = np.flatnonzero(contact.efc_address >= 0)
     first, second = contact.geom[touching].T
     pair = bodies.pair[first, second]
+    on_object = pair < len(bodies.names)  # links meet without friction
+    if not on_object.all():
+        touching, pair = touching[on_object], pair[on_object]
     normal = contact.frame[touching, :2] * bodies.toward[pair, None]
     tangent_x, tangent_y = normal[:, 1], -normal[:, 0]
     x, y = contact.pos[touching, :2].T

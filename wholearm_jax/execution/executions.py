@@ -12,7 +12,7 @@ lies on its feature.
 # pyright: reportAttributeAccessIssue=false
 
 import enum
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -55,6 +55,7 @@ class ExecutionOutcome(enum.Enum):
     """What became of an execution."""
 
     OK = "ok"
+    LINKS_MET = "links_met"  # links touched that should not have
     CONTACT_LOST = "contact_lost"  # a contact of the last phase is open
     ASTRAY = "astray"  # all are closed, but the object does not stand where it should
     DIVERGED = "diverged"  # MuJoCo gave up, or contacts crept farther than the tolerance: too long a time step
@@ -86,8 +87,9 @@ class Execution:
 
     `course` is what happened, at every step; `expected` what was predicted (NaN: friction holds the object at rest, or
     the prediction ended). Their contacts are `names`, all pairs that may touch; `planned` are those of the phases,
-    which do not say here whether they should roll. `creep` is how far contacts slipped against Coulomb's law, at most
-    [m]: an execution that crept farther than its tolerance diverged.
+    which do not say here whether they should roll. `link_contacts` are what links met, and when first [s]. `creep` is
+    how far contacts slipped against Coulomb's law, at most [m]: an execution that crept farther than its
+    tolerance diverged.
     """
 
     prediction: Result
@@ -100,6 +102,7 @@ class Execution:
     creep: float
     open_at_end: tuple[str, ...]
     events: tuple[Event, ...]
+    link_contacts: dict[str, float]
     timestep: float
     model_xml: str
 
@@ -123,6 +126,8 @@ class Execution:
         """What became of the execution, in one line."""
         off = f"{1e3 * self.position_error:.3g} mm and {abs(self.angle_error):.2g} rad from the predicted end"
         why = f" at {', '.join(self.open_at_end)}" if self.open_at_end else ""
+        if self.ending is ExecutionOutcome.LINKS_MET:
+            why = ": " + ", ".join(f"{name} at {time:.4g} s" for name, time in self.link_contacts.items())
         if self.ending is ExecutionOutcome.DIVERGED:
             crept = f"contacts crept {1e3 * self.creep:.3g} mm"
             why = f" ({crept if np.isfinite(self.creep) else 'MuJoCo gave up'}: take a shorter time step)"
@@ -151,11 +156,12 @@ def execute(
     require_wires(prediction)
     times, step = clock(scene, timestep)
     bodies = build_mujoco_model(scene, step, softness)
-    course, creep = run_schedule(
+    course, creep, met = run_schedule(
         bodies, scene, start_of(prediction), motor_torques(prediction.torque, times, step), step
     )
     expected, target = _expected(prediction, bodies.names), target_of(prediction)
-    ending, lost = assess_execution(scene, course.z[-1], target, tolerance, creep)
+    unexpected = {} if meets_obstacle(prediction) else met
+    ending, lost = assess_execution(scene, course.z[-1], target, tolerance, creep, unexpected)
     return Execution(
         prediction=prediction,
         course=course,
@@ -167,9 +173,15 @@ def execute(
         creep=creep,
         open_at_end=lost,
         events=_events(bodies.names, expected, course),
+        link_contacts=met,
         timestep=step,
         model_xml=bodies.xml,
     )
+
+
+def meets_obstacle(prediction: Result) -> bool:
+    """Whether the prediction itself ends where links meet or a joint's range ends."""
+    return any(bool(phase.traced.dynamics.ends_at_obstacle) for phase in prediction.phases)
 
 
 def require_wires(prediction: Result) -> None:
@@ -214,34 +226,52 @@ def target_of(prediction: Result) -> Float[np.ndarray, "5"]:
     return np.asarray(end)
 
 
-def run_schedule(bodies: MujocoModel, scene: Scene, start, torques, timestep: float) -> tuple[ExecutedMotion, float]:
-    """The course of `trace_phase_path`, and how far contacts crept."""
-    z, z_dot, forces, creep = rollout(bodies, start, torques)
+def run_schedule(
+    bodies: MujocoModel, scene: Scene, start, torques, timestep: float
+) -> tuple[ExecutedMotion, float, dict[str, float]]:
+    """The course of `rollout`, how far contacts crept, and what links met, when first [s]."""
+    z, z_dot, forces, creep, met = rollout(bodies, start, torques)
     times = np.arange(len(z)) * timestep
-    return ExecutedMotion(
-        times, z, z_dot, forces[..., 0], forces[..., 1], touching_contacts_at(scene, bodies.names, z)
-    ), creep
+    return (
+        ExecutedMotion(times, z, z_dot, forces[..., 0], forces[..., 1], touching_contacts_at(scene, bodies.names, z)),
+        creep,
+        met,
+    )
 
 
 def rollout(bodies: MujocoModel, start, torques):
     """Step the model from rest at `start`: `z`, `z_dot` and forces `(c_n, c_t)`; row `k` is the state before step `k`.
 
-    The last is how far contacts slipped against Coulomb's law in all steps together, at most [m]; infinite where
-    MuJoCo gave up.
+    Then how far contacts slipped against Coulomb's law in all steps together, at most [m], infinite where MuJoCo gave
+    up; and what links met, or which range ended, when first [s].
     """
     data, step = mujoco.MjData(bodies.model), stepper(bodies)
     count, pairs = len(torques), len(bodies.names)
     z, z_dot, forces = np.empty((count + 1, 5)), np.empty((count + 1, 5)), np.empty((count + 1, pairs, 2))
     data.qpos[:] = start
-    found, creep = np.zeros((pairs, 2)), 0.0
+    found, creep, met = np.zeros((pairs, 2)), 0.0, {}
     for k, torque in enumerate(torques):
         z[k], z_dot[k] = data.qpos, data.qvel
         found, wrong = step(bodies, data, torque, found)
         forces[k], creep = found, creep + wrong * bodies.model.opt.timestep
+        _record_meetings(bodies, data, k * bodies.model.opt.timestep, met)
     z[count], z_dot[count] = data.qpos, data.qvel
     forces[count], _ = step(bodies, data, torques[-1], found)  # beyond the end, for the forces there
     gave_up = any(warning.number for warning in data.warning)
-    return z, z_dot, forces, np.inf if gave_up else creep
+    return z, z_dot, forces, np.inf if gave_up else creep, met
+
+
+def _record_meetings(bodies: MujocoModel, data: mujoco.MjData, time: float, met: dict[str, float]) -> None:
+    """Note the time of links that touch for the first time, and of joints at the ends of their ranges."""
+    geom = data.contact.geom
+    if len(geom):
+        rows = bodies.pair[geom[:, 0], geom[:, 1]] - len(bodies.names)
+        for row in rows[rows >= 0]:
+            met.setdefault(bodies.link_meetings[row], time)
+    if data.nl:
+        beyond = (data.qpos[3:] < bodies.model.jnt_range[3:, 0]) | (data.qpos[3:] > bodies.model.jnt_range[3:, 1])
+        for finger in np.flatnonzero(beyond):
+            met.setdefault(f"finger{finger + 1} reaches its range", time)
 
 
 def stepper(bodies: MujocoModel) -> Callable:
@@ -265,7 +295,7 @@ def _read_forces(bodies: MujocoModel, data: mujoco.MjData, into) -> None:
     row = bodies.pair[contact.geom[:, 0], contact.geom[:, 1]]
     axes = contact.frame.reshape(-1, 3, 3)[:, :, :2]
     at = contact.efc_address
-    acting = np.flatnonzero(at >= 0)
+    acting = np.flatnonzero((at >= 0) & (row < len(bodies.names)))
     rows = at[acting, None] + np.arange(3)
     force = np.einsum("ci,cik->ck", data.efc_force[rows], axes[acting])
     toward = bodies.toward[row[acting]]
@@ -291,7 +321,7 @@ def _touching(solid: RigidBody, hand: Hand, pairs: ContactFormation, z, slack):
 
 
 def assess_execution(
-    scene: Scene, z, target, tolerance: Tolerance, creep: float = 0.0
+    scene: Scene, z, target, tolerance: Tolerance, creep: float = 0.0, links_met: Collection[str] = ()
 ) -> tuple[ExecutionOutcome, tuple[str, ...]]:
     """What became of an execution that ended at `z` and crept so far, and which contacts of the last phase are open."""
     names = tuple(map(feature_pair, scene.phases[-1].formation.names))
@@ -299,6 +329,8 @@ def assess_execution(
     lost = tuple(name for name, there in zip(names, closed, strict=True) if not there)
     off = np.abs(z - target)
     near = np.hypot(*off[:2]) <= tolerance.position and off[2] <= tolerance.angle
+    if links_met:
+        return ExecutionOutcome.LINKS_MET, lost
     if not creep <= tolerance.position:
         return ExecutionOutcome.DIVERGED, lost
     return (ExecutionOutcome.CONTACT_LOST if lost else ExecutionOutcome.OK if near else ExecutionOutcome.ASTRAY), lost

@@ -14,6 +14,10 @@ make MuJoCo's distances equal the C-functions:
   object. Wedges do not overlap, so that a concave object needs no decomposition. (MuJoCo keeps their corners in single
   precision: a few nanometres.)
 
+The links are bodies among themselves, too: fingertips and joints are dots against the other finger, on the side of it
+on which they start, and fingertips against the palm, without friction; ranges are joint limits. Layered fingers do not
+meet.
+
 A pair thus touches at one point of the plane. If `a_free` is the acceleration of the gap `C` without the contact, then
 
     C_ddot = (1 - d) a_free - d (b C_dot + k C),    b = 2 / (d t_c),  k = 1 / (d t_c^2)        (`ContactCompliance`)
@@ -75,14 +79,15 @@ CONVEX = ContactCompliance(impedance=0.5, friction="convex")
 class MujocoModel:
     """A compiled model, the names of its contacts, and what Coulomb's friction needs of both.
 
-    `pair[geom1, geom2]` is the row of `names` that two shapes belong to (-1: none); `toward[row]` is 1
-    where MuJoCo's contact normal points into the object and -1 where it points out of it. Each row has its `link` and
-    its `friction` coefficient; `joint` are the fingers' joints [m], and `mobility` is the diagonal of `M^-1`. `xml` is
-    the model as MJCF, always with MuJoCo's friction.
+    `pair[geom1, geom2]` is the row of `names`, or after them of `link_meetings`, that two shapes belong to (-1: none);
+    `toward[row]` is 1 where MuJoCo's contact normal points into the object and -1 where it points out of it. Each row
+    of `names` has its `link` and its `friction` coefficient; `joint` are the fingers' joints [m], and `mobility` is the
+    diagonal of `M^-1`. `xml` is the model as MJCF, always with MuJoCo's friction.
     """
 
     model: mujoco.MjModel
     names: tuple[str, ...]
+    link_meetings: tuple[str, ...]
     pair: Int[np.ndarray, "geoms geoms"]
     toward: Int[np.ndarray, "rows"]
     link: Int[np.ndarray, "rows"]
@@ -99,8 +104,9 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
     size = float(np.sqrt((solid.vertices[: solid.count] ** 2).sum(1).max()))
     spec = _world(scene, timestep, softness)
     _add_object(spec, solid, size)
-    _add_hand(spec, scene.hand, size)
+    _add_hand(spec, scene.hand, size, _gives_way(softness, timestep))
     rows = _add_pairs(spec, solid, size, timestep, softness)
+    meetings = _add_link_pairs(spec, scene, size, timestep, softness)
     model = spec.compile()
     if softness.friction == "coulomb":
         model.pair_dim[:] = 1  # normal forces alone
@@ -110,11 +116,16 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
         first, second = sorted((model.geom(ours).id, model.geom(other).id), key=lambda g: model.geom_type[g])
         pair[first, second] = pair[second, first] = row
         toward[row] = 1 if second == model.geom(ours).id else -1
+    link_meetings = tuple(dict.fromkeys(name for name, _, _ in meetings))
+    for name, one, other in meetings:
+        first, second = model.geom(one).id, model.geom(other).id
+        pair[first, second] = pair[second, first] = len(rows) + link_meetings.index(name)
     link = np.array([parse_contact(name)[0] for name in rows])
     inertia = np.array([solid.mass, solid.mass, solid.inertia, *np.asarray(scene.hand.inertia)])
     return MujocoModel(
         model=model,
         names=tuple(rows),
+        link_meetings=link_meetings,
         pair=pair,
         toward=toward,
         link=link,
@@ -130,6 +141,7 @@ def _world(scene, timestep, softness):
     """Options: a Newton solver on elliptic cones, solved to rounding level; joint damping taken implicitly."""
     spec = mujoco.MjSpec()
     spec.modelname = scene.title
+    spec.compiler.degree = False
     option = spec.option
     option.timestep = timestep
     option.gravity = [*np.asarray(scene.gravity), 0.0]
@@ -164,8 +176,11 @@ def _add_object(spec, solid, size):
         _add_geom(body_, f"e{k}", "MESH", [0, 0, 0], [0, 0, 0], meshname=f"e{k}")
 
 
-def _add_hand(spec, hand, size):
-    """The palm, and two fingers with a motor each; the tip is a dot at the end of the contact edge."""
+def _add_hand(spec, hand, size, compliance):
+    """The palm, and two fingers with a motor each; the tip is a dot at the end of the contact edge.
+
+    What only links meet: a dot on the joint, one at the end of a back apart from the contact edge, and the back's slab.
+    """
     left, right = float(hand.joint[1, 0]), float(hand.joint[0, 0])
     thick, dot = HALF_SPACE_DEPTH * size, POINT_RADIUS * size
     _add_slab(spec.worldbody, "palm", left, right, -dot, -1.0, thick)
@@ -181,9 +196,17 @@ def _add_hand(spec, hand, size):
             # Dry friction is as stiff as MuJoCo makes it: the joint creeps least where it should stand.
             solref_friction=[2 * spec.option.timestep, 1.0],
             solimp_friction=[0.999, 0.999, 1e-3, 0.5, 2],
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            range=np.asarray(hand.range[k]),
+            solref_limit=compliance["solref"],
+            solimp_limit=compliance["solimp"],
         )
         _add_slab(finger, name, 0.0, length, side * offset - side * dot, -side, thick)
         _add_geom(finger, f"{name}_tip", "SPHERE", [dot, 0, 0], [length, side * offset, 0])
+        back = float(hand.back[k])
+        _add_slab(finger, f"{name}_back", 0.0, length, -side * (back - dot), side, thick)
+        _add_geom(finger, f"{name}_back_tip", "SPHERE", [dot, 0, 0], [length, -side * back, 0])
+        _add_geom(spec.worldbody, f"{name}_joint", "SPHERE", [dot, 0, 0], [*np.asarray(hand.joint[k]), 0])
         motor = spec.add_actuator(name=name, target=f"theta{k + 1}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.gainprm[0], motor.biastype = 1.0, mujoco.mjtBias.mjBIAS_NONE
 
@@ -220,11 +243,46 @@ def _add_pairs(spec, solid, size, timestep, softness):
             condim=3,
             margin=PAIR_DISTANCE * size,
             friction=[float(solid.friction[link])] * 2 + [0, 0, 0],
-            solref=[softness.time_constant * timestep, 1.0],
             solreffriction=[0.0, -b * d],
-            solimp=[d, d, 1e-3, 0.5, 2],
+            **_gives_way(softness, timestep),
         )
     return rows
+
+
+def _gives_way(softness: ContactCompliance, timestep: float) -> dict[str, list[float]]:
+    """MuJoCo's parameters of a contact or a limit that gives way as `softness` says."""
+    d = softness.impedance
+    return {"solref": [softness.time_constant * timestep, 1.0], "solimp": [d, d, 1e-3, 0.5, 2]}
+
+
+def _add_link_pairs(spec, scene, size, timestep, softness) -> list[tuple[str, str, str]]:
+    """Declare the pairs of links that may meet: (what meets, the dot, the slab)."""
+    hand, meetings = jax.tree.map(np.asarray, scene.hand), []
+    for k, name in enumerate(LINKS[1:]):
+        other = LINKS[2 - k]
+        tips = [f"{name}_tip", f"{name}_back_tip"][: 1 if hand.offset[k] + hand.back[k] == 0 else 2]
+        meetings += [(f"{name} meets the palm", tip, "palm") for tip in tips]
+        if not hand.layered:
+            slab = other if _starts_before(hand, k, np.asarray(scene.start)[3:]) else f"{other}_back"
+            meetings += [("finger1 meets finger2", dot, slab) for dot in (*tips, f"{name}_joint")]
+    for _, dot, slab in meetings:
+        spec.add_pair(
+            name=f"{dot} on {slab}",
+            geomname1=dot,
+            geomname2=slab,
+            condim=1,
+            margin=PAIR_DISTANCE * size,
+            **_gives_way(softness, timestep),
+        )
+    return meetings
+
+
+def _starts_before(hand, k: int, angles) -> bool:
+    """Whether a finger's tip is on that side of the other finger on which the object is."""
+    other, side = 1 - k, (1.0, -1.0)[1 - k]
+    tip = hand.joint[k] + hand.length[k] * np.array([np.cos(angles[k]), np.sin(angles[k])]) - hand.joint[other]
+    across = side * np.array([-np.sin(angles[other]), np.cos(angles[other])])
+    return bool(tip @ across > (hand.offset[other] - hand.back[other]) / 2)
 
 
 def _wedges(corners, behind):

@@ -29,6 +29,7 @@ from wholearm_jax.execution.executions import (
     Tolerance,
     assess_execution,
     clock,
+    meets_obstacle,
     motor_torques,
     require_wires,
     rollout,
@@ -127,8 +128,9 @@ def run_trials(
 
     found = rollout_in_parallel(copies(), torques, min(workers or os.cpu_count() or 1, count))
     runs = []
-    for scene, (end, creep) in zip(scenes, found, strict=True):
-        ending, _ = assess_execution(scene, end, target, tolerance, creep)
+    expected = meets_obstacle(prediction)
+    for scene, (end, creep, met) in zip(scenes, found, strict=True):
+        ending, _ = assess_execution(scene, end, target, tolerance, creep, {} if expected else met)
         runs.append(_summary(prediction.scene, scene, end, target, ending))
         if callback is not None:
             callback(runs[-1])
@@ -180,16 +182,16 @@ def _touch_down(shape, hand, gravity, formation: ContactFormation, z, shift) -> 
 
 def rollout_in_parallel(
     copies: Iterable[tuple[MujocoModel, Float[np.ndarray, "5"]]], torques, workers: int
-) -> Iterator[tuple[Float[np.ndarray, "5"], float]]:
-    """Where free bodies end, driven from rest at their starts, and how far contacts crept
+) -> Iterator[tuple[Float[np.ndarray, "5"], float, dict[str, float]]]:
+    """Where free bodies end, driven from rest at their starts, how far contacts crept, and what links met
     (`execution.trace_phase_path`)."""
     each = (delayed(_end)(bodies, start, torques) for bodies, start in copies)
     return Parallel(n_jobs=workers, return_as="generator")(each)  # pyright: ignore[reportReturnType]
 
 
-def _end(bodies: MujocoModel, start, torques) -> tuple[Float[np.ndarray, "5"], float]:
-    z, _, _, creep = rollout(bodies, start, torques)
-    return z[-1], creep
+def _end(bodies: MujocoModel, start, torques) -> tuple[Float[np.ndarray, "5"], float, dict[str, float]]:
+    z, _, _, creep, met = rollout(bodies, start, torques)
+    return z[-1], creep, met
 
 
 def _summary(scene: Scene, changed: Scene, end, target, ending: ExecutionOutcome) -> PerturbedRun:

@@ -33,6 +33,7 @@ def execution_summary(execution: Execution, trials: TrialsResult | None = None, 
         "creep": execution.creep,
         "tolerance": execution.tolerance._asdict(),
         "open_at_end": list(execution.open_at_end),
+        "link_contacts": execution.link_contacts,
         "events": [event._asdict() for event in execution.events],
         "prediction": prediction,
     }

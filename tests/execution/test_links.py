@@ -1,0 +1,83 @@
+"""Links are bodies in MuJoCo, too: what meets stops, is reported, and fails an execution; layered fingers pass."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import layered
+
+import wholearm_jax as wa
+from wholearm_jax.execution.executions import ExecutionOutcome, execute, run_schedule
+from wholearm_jax.execution.mujoco_model import CONVEX, build_mujoco_model
+
+DATA = Path(__file__).parents[1] / "data"
+LENGTH = 0.17  # [m] of the fingers
+
+
+def on_one_plane(scene):
+    return eqx.tree_at(lambda s: s.hand.layered, scene, jnp.asarray(False))
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    """The heptagon's flip alone, predicted for layered fingers: it begins with fingers apart, and they cross."""
+    scene, torque = layered("heptagon"), wa.read_torque(DATA / "heptagon_torque.csv")
+    first = int(np.flatnonzero(np.asarray(torque.times) <= 1.0)[-1])
+    flip = eqx.tree_at(lambda s: (s.start, s.phases), scene, (wa.trace(scene)[0].end, scene.phases[1:]))
+    return wa.simulate(flip, wa.torque_schedule(torque.times[first:] - 1.0, torque.values[first:]))
+
+
+def test_a_layered_hand_has_no_pair_of_fingers(crossing):
+    meetings = build_mujoco_model(crossing.scene, 2e-4).link_meetings
+    assert meetings == ("finger1 meets the palm", "finger2 meets the palm")
+    coplanar = build_mujoco_model(on_one_plane(crossing.scene), 2e-4).link_meetings
+    assert set(coplanar) - set(meetings) == {"finger1 meets finger2"}
+
+
+def test_a_plan_made_to_cross_is_stopped_and_reported(crossing):
+    assert crossing.status is wa.Status.OK
+    done = execute(crossing, timestep=2e-4)
+    assert (done.ending, done.link_contacts) == (ExecutionOutcome.OK, {})
+    stopped = execute(replace(crossing, scene=on_one_plane(crossing.scene)), timestep=2e-4)
+    assert stopped.ending is ExecutionOutcome.LINKS_MET
+    time = min(stopped.link_contacts.values())
+    assert stopped.message.startswith(f"links_met: finger1 meets finger2 at {time:.4g} s")
+    assert 0.01 < time < 0.5
+    assert stopped.position_error > 1e-3
+    after = (stopped.course.time >= time) & (stopped.course.time < time + 0.5)  # jammed for longer, steps are unstable
+    assert deepest(stopped.course.z[after], crossing.scene.hand) < 1e-4
+
+
+def deepest(z, hand):
+    """How far a fingertip is on the wrong side of the other finger's line, at most, where it is beside it [m]."""
+    depths = [0.0]
+    for k, other, side in ((0, 1, -1.0), (1, 0, 1.0)):
+        joint, length = np.asarray(hand.joint), np.asarray(hand.length)
+        tip = joint[k] + length[k] * np.stack([np.cos(z[:, 3 + k]), np.sin(z[:, 3 + k])], 1) - joint[other]
+        along = np.stack([np.cos(z[:, 3 + other]), np.sin(z[:, 3 + other])], 1)
+        height = side * (along[:, 0] * tip[:, 1] - along[:, 1] * tip[:, 0])
+        place = (tip * along).sum(1)
+        depths.append(np.max(np.where((place > 0) & (place < length[other]), -height, 0.0)))
+    return max(depths)
+
+
+@pytest.mark.parametrize("softness", ["coulomb", "convex"])
+def test_a_joint_stops_at_the_end_of_its_range_and_a_tip_on_the_palm(crossing, softness):
+    """Idle fingers far from the object, driven outward, and one of a lifted joint driven onto the palm."""
+    chosen = CONVEX if softness == "convex" else type(CONVEX)()
+    scene = eqx.tree_at(lambda s: s.hand.range, on_one_plane(crossing.scene), jnp.asarray([[0.5, np.pi], [0.0, 2.5]]))
+    start, torques = np.array([0.0, 1.0, 0.0, 0.7, 2.3]), np.tile([-0.05, 0.05], (2000, 1))
+    course, _, met = run_schedule(build_mujoco_model(scene, 2e-4, chosen), scene, start, torques, 2e-4)
+    assert set(met) == {"finger1 reaches its range", "finger2 reaches its range"}
+    np.testing.assert_allclose(course.z[-1, 3:], [0.5, 2.5], atol=1e-4)
+    lifted = eqx.tree_at(lambda s: s.hand.joint, crossing.scene, jnp.asarray([[0.08, 0.08], [-0.08, 0.08]]))
+    lifted = eqx.tree_at(lambda s: s.hand.range, lifted, jnp.asarray([[0.0, 4.0], [-1.0, np.pi]]))
+    course, _, met = run_schedule(
+        build_mujoco_model(lifted, 2e-4, chosen), lifted, np.array([0.0, 1.0, 0.0, 3.3, -0.1]), -torques, 2e-4
+    )
+    assert "finger1 meets the palm" in met
+    tip = 0.08 + LENGTH * np.sin(course.z[-1, 3])
+    assert abs(tip) < 1e-4
