@@ -11,13 +11,13 @@ from scipy.optimize import linprog
 from support import layered
 
 import wholearm_jax as wa
-from wholearm_jax.margin import BOUND_PLACES, BOUND_SPEEDS, MAX_SPEED_RATIO
+from wholearm_jax.margin import BOUND_PLACES, BOUND_SPEEDS, MAX_SPEED_RATIO, margin_upper_bound
 from wholearm_jax.margin import quasistatic as squeeze
 from wholearm_jax.model import Arrival
 
 coefficients, bound, hold = (
     jax.jit(squeeze.affine_coefficients),
-    jax.jit(squeeze.margin_upper_bound),
+    jax.jit(margin_upper_bound),
     jax.jit(squeeze.best_quasistatic_torque),
 )
 
