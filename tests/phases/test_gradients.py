@@ -28,12 +28,12 @@ def thinned(torque, rows):
 
 
 @pytest.mark.parametrize(
-    ("rows", "expected"), [(MAX_FORWARD_DIRECTIONS, "forward"), (MAX_FORWARD_DIRECTIONS + 1, "reverse")]
+    ("rows", "expected"), [(MAX_FORWARD_DIRECTIONS, Adjoint.FORWARD), (MAX_FORWARD_DIRECTIONS + 1, Adjoint.REVERSE)]
 )
 def test_both_modes_agree_with_differences(rows, expected):
     scene = layered("heptagon")
     schedule, traced = thinned(wa.read_torque(DATA / "heptagon_torque.csv"), rows), wa.trace(scene)
-    assert choose_mode(schedule) == expected
+    assert choose_mode(schedule) is expected
     margin, slope = torque_gradient(scene, schedule, traced=traced)
     assert float(margin) == pytest.approx(wa.simulate(scene, schedule, traced=traced).margin, rel=1e-9)
     way = np.random.default_rng(1).normal(size=(rows, 2)) * 0.005
