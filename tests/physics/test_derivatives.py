@@ -49,7 +49,12 @@ CASES = {
     "time runs out": ("heptagon", 0, 0.99),
     "past the slip reversal": ("heptagon", 1, 1.01),
     "frictionless": ("hexagon", 0, 1.01, lambda data: data["object"].update(friction=0.0)),
-    "undamped": ("hexagon", 0, 1.0, lambda data: [f.update(viscous=0.0, dry=0.0) for f in data["hand"].values()]),
+    "undamped": (
+        "hexagon",
+        0,
+        1.0,
+        lambda data: [data["hand"][f].update(viscous=0.0, dry=0.0) for f in ("finger1", "finger2")],
+    ),
 }
 
 

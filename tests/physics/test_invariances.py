@@ -91,7 +91,7 @@ def test_mirror_image(original):
     count = len(data["object"]["vertices"])
     swap = {"finger1": "finger2", "finger2": "finger1"}
     hand, solid, start = data["hand"], data["object"], data["start"]
-    data["hand"] = {swap[key]: hand[key] | {"joint": [-hand[key]["joint"][0], hand[key]["joint"][1]]} for key in hand}
+    data["hand"] = hand | {swap[k]: hand[k] | {"joint": [-hand[k]["joint"][0], hand[k]["joint"][1]]} for k in swap}
     solid["vertices"] = [[-x, y] for x, y in reversed(solid["vertices"])]
     solid["friction"] = {swap.get(key, key): value for key, value in solid["friction"].items()}
     data["gravity"][0] *= -1
@@ -122,7 +122,7 @@ def test_units(original, units):
     moment = mass * length**2
     scales = {"length": length, "inertia": moment, "viscous": moment / time}
     scales |= {"dry": moment / time**2, "torque_limit": moment / time**2}
-    for finger in data["hand"].values():
+    for finger in (data["hand"][name] for name in ("finger1", "finger2")):
         finger["joint"] = [length * c for c in finger["joint"]]
         finger["offset"] *= length
         for key, scale in scales.items():

@@ -199,7 +199,7 @@ def test_pivot_by_hand():
     """
     data = tipping()
     data["object"]["friction"] = {"palm": 0.6, "finger1": 0.0, "finger2": 0.0}
-    for finger in data["hand"].values():
+    for finger in (data["hand"][name] for name in ("finger1", "finger2")):
         finger |= {"dry": 0.0, "viscous": 0.0}
     traced = wholearm_jax.trace(wholearm_jax.parse(data))[0]
     dynamics, path = traced.dynamics, traced.path
@@ -228,7 +228,7 @@ def test_pivot_by_hand():
             arms.append(np.sqrt(square))
             pushes.append((1 if k == 0 else -1) * unreduced.quarter(reach) / np.sqrt(square))
         rates, bends, arms = np.array(rates), np.array(bends), np.array(arms)
-        levers = np.array([f["inertia"] for f in data["hand"].values()])
+        levers = np.array([f["inertia"] for f in (data["hand"][name] for name in ("finger1", "finger2"))])
         centre = -turn @ vertices[0]  # from the pivot to the centre of mass
         total = inertia + mass * centre @ centre + levers @ rates**2
         pull = torque @ rates - mass * data["gravity"][1] * -centre[0] - levers @ (rates * bends) * spin**2
@@ -305,7 +305,8 @@ def test_mirror_image():
     torque = passing(wholearm_jax.trace(wholearm_jax.parse(data))[0].dynamics)
     mirrored, count = copy.deepcopy(data), len(data["object"]["vertices"])
     swap = {"finger1": "finger2", "finger2": "finger1"}
-    mirrored["hand"] = {swap[k]: f | {"joint": [-f["joint"][0], f["joint"][1]]} for k, f in data["hand"].items()}
+    fingers = {name: data["hand"][name] for name in swap}
+    mirrored["hand"] |= {swap[k]: f | {"joint": [-f["joint"][0], f["joint"][1]]} for k, f in fingers.items()}
     solid = mirrored["object"]
     solid["vertices"] = [[-x, y] for x, y in reversed(solid["vertices"])]
     solid["friction"] = {swap.get(k, k): value for k, value in solid["friction"].items()}

@@ -187,7 +187,7 @@ def to_dict(scene: Scene) -> dict[str, Any]:
     fingers = [
         {key: np.asarray(getattr(scene.hand, key))[k].tolist() for key in FingerTable.model_fields} for k in range(2)
     ]
-    layers = "layered" if bool(scene.hand.layered) else "coplanar"
+    layers = {"fingers": "layered"} if bool(scene.hand.layered) else {}
     shape = scene.object
     table = {
         "vertices": np.asarray(shape.vertices)[: int(shape.count)].tolist(),
@@ -203,7 +203,7 @@ def to_dict(scene: Scene) -> dict[str, Any]:
     return {
         "title": scene.title,
         "gravity": np.asarray(scene.gravity).tolist(),
-        "hand": {"fingers": layers, "finger1": fingers[0], "finger2": fingers[1]},
+        "hand": {"finger1": fingers[0], "finger2": fingers[1]} | layers,
         "object": table,
         "start": dict(zip(COORDINATES, np.asarray(scene.start).tolist(), strict=True)),
         "phase": [_phase_dict(phase) for phase in scene.phases],

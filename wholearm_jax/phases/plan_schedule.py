@@ -6,7 +6,7 @@ from wholearm_jax.core import is_traced
 from wholearm_jax.model import Arrival, Scene, TorqueSchedule, find_schedule_defect, has_jumps
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
-LONG_SCHEDULE = 1.5  # length of a schedule, over that of its plan, from which it is noted
+LONG_SCHEDULE = 3.0  # length of a schedule, over that of its plan, from which it is noted
 
 
 def require_motion(scene: Scene) -> None:
