@@ -34,7 +34,11 @@ def block(friction=MU, dry=(DRY, DRY), mass=MASS, limits=(LIMIT, LIMIT)):
         {
             "title": "block",
             "gravity": 9.81,
-            "hand": {"finger1": right | {"joint": [HALF, 0.0]}, "finger2": left | {"joint": [-HALF, 0.0]}},
+            "hand": {
+                "fingers": "layered",
+                "finger1": right | {"joint": [HALF, 0.0]},
+                "finger2": left | {"joint": [-HALF, 0.0]},
+            },
             "object": {
                 "vertices": [[-HALF, -HALF], [HALF, -HALF], [HALF, HALF], [-HALF, HALF]],
                 "mass": mass,

@@ -44,7 +44,7 @@ def test_a_schedule_that_cannot_be_followed_is_refused_at_once(function, row, co
     [
         (2.0, None),
         (2.5, None),
-        (4.0, "goes on to 4 s, 2 times the plan's 2 s"),
+        (8.0, "goes on to 8 s, 4 times the plan's 2 s"),
         (2000.0, "goes on to 2000 s, 1e+03 times the plan's 2 s; are its times in milliseconds?"),
     ],
 )

@@ -34,7 +34,7 @@ def cornered(joints):
         {
             "title": "rectangle",
             "gravity": GRAVITY,
-            "hand": {"finger1": fingers[0], "finger2": fingers[1]},
+            "hand": {"fingers": "layered", "finger1": fingers[0], "finger2": fingers[1]},
             "object": {
                 "vertices": [[-W, 0.0], [W, 0.0], [W, H], [-W, H]],
                 "mass": MASS,
