@@ -43,7 +43,7 @@ def scene(vertices, contacts, toward, start, *, joint, length, offset=(0.0, 0.0)
             "title": "edge",
             "gravity": 9.81,
             "hand": {"fingers": "layered"}
-            | {name: alike | {"joint": [x, 0.0], "offset": away, "range": [-7.0, 7.0]} for name, x, away in places},
+            | {name: alike | {"joint": [x, 0.0], "offset": away, "range": [-6.2, 6.2]} for name, x, away in places},
             "object": {"vertices": vertices, "mass": 1.0, "friction": 0.2},
             "start": dict(zip(("x", "y", "phi", "theta1", "theta2"), start, strict=True)),
             "phase": [

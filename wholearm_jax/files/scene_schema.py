@@ -3,7 +3,7 @@
 import difflib
 import math
 import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -184,7 +184,7 @@ class SceneTables(_Strict):
     phase: Annotated[list[PhaseTable], Field(min_length=1)]
 
     @model_validator(mode="after")
-    def _known_features(self) -> "_Scene":
+    def _known_features(self) -> Self:
         count = len(self.object.vertices)
         names = [phase.name for phase in self.phase]
         for k, phase in enumerate(self.phase):

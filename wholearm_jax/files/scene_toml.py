@@ -65,7 +65,7 @@ def load_start(name: str | Path) -> Scene:
     return eqx.tree_at(lambda s: s.phases, parse(data | {"phase": [placeholder]}, str(name)), ())
 
 
-def load_goal(name: str | Path) -> dict[str, dict[str, float]] | None:
+def load_goal(name: str | Path) -> dict[str, Any] | None:
     """Read the goal of a scene file: keyword arguments `goal`, `by` and `tolerance` of `plan`; None without one.
 
     Raises:

@@ -193,7 +193,7 @@ def _iterate(p: PathProgramme, at: _Iterate, fast: bool) -> _Iterate:
 
     terms = zip(live, inequalities(p, x), slack, strict=True)
     residual = jnp.stack([jnp.abs(one * (r - s)).max() for one, r, s in terms]).max()
-    return _Iterate(x, slack, multiplier, _product(live, slack, multiplier), residual, at.count + 1)
+    return _Iterate(x, slack, multiplier, jnp.asarray(_product(live, slack, multiplier)), residual, at.count + 1)
 
 
 def _assemble(p: PathProgramme, at: _Iterate, fast: bool) -> _NewtonSystem:

@@ -128,8 +128,8 @@ def link_obstacles(hand: Hand) -> LinkObstacles:
     width = 2 * half_width[_OTHER - 1]
     contacts = ContactSet(
         on_link=jnp.asarray(~face),
-        finger=(line[:, 0] * one, line[:, 1] * one),
-        side=_SIDE[_LINE_LINK] * one,
+        finger=(jnp.asarray(line[:, 0]), jnp.asarray(line[:, 1])),
+        side=jnp.asarray(_SIDE[_LINE_LINK]),
         joint=tuple((line @ hand.joint).T),
         reach=jnp.where(face, hand.length[_LINK - 1], line_length),
         offset=jnp.where(face, corner_height, line @ middle),
@@ -141,7 +141,7 @@ def link_obstacles(hand: Hand) -> LinkObstacles:
         tangential=one < 0,
         slides=one < 0,
         rolling_anchor=0 * one,
-        carrier=Carrier(0 * one, (point[:, 0] * one, point[:, 1] * one), tuple((point @ hand.joint).T)),
+        carrier=Carrier(0 * one, (jnp.asarray(point[:, 0]), jnp.asarray(point[:, 1])), tuple((point @ hand.joint).T)),
     )
     sign = np.where(_IS_ANGLE, np.where(_MEETING == LinkMeeting.LEAST_ANGLE, 1.0, -1.0), 0.0)
     limit = hand.range[_LINK - 1, (_MEETING == LinkMeeting.LARGEST_ANGLE).astype(int)]
@@ -149,8 +149,8 @@ def link_obstacles(hand: Hand) -> LinkObstacles:
     return LinkObstacles(
         contacts=contacts,
         gap=jnp.where(_IS_ANGLE, 0.0, one),
-        joint_angle=(sign * _of_finger(_LINK)[:, 0] * one, sign * _of_finger(_LINK)[:, 1] * one),
-        shift=-sign * limit,
+        joint_angle=(jnp.asarray(sign * _of_finger(_LINK)[:, 0]), jnp.asarray(sign * _of_finger(_LINK)[:, 1])),
+        shift=jnp.asarray(-sign * limit),
         half_width=jnp.where(two_sided, line @ half_width, 0.0),
         two_sided=jnp.asarray(two_sided),
         exists=jnp.asarray(~_ON_FINGER) | ~hand.layered,

@@ -46,11 +46,11 @@ def tradeoff(
     """
     traced = traced or trace(scene)
     best = convex_bounds(scene, any_duration=True, traced=traced)
-    phases = tuple(k for k, motion in enumerate(best) if motion is not None)
-    largest = np.array([best[k].margin for k in phases])
+    moving = {k: motion for k, motion in enumerate(best) if motion is not None}
+    phases, largest = tuple(moving), np.array([motion.margin for motion in moving.values()])
     if not phases or not largest.min() > 0:
         raise ValueError("no torque moves the object with every contact compressive")
     margins = largest.min() * np.asarray(fractions)
     motions = [shortest_motions(scene, margin, traced=traced) for margin in margins]
-    durations = np.array([[row[k].duration for k in phases] for row in motions])
+    durations = np.array([[motion.duration for motion in row if motion is not None] for row in motions])
     return Tradeoff(phases, largest, margins, durations)

@@ -62,4 +62,4 @@ def make_goal(
     ):
         raise ValueError("goal: values must be finite, tolerances positive")
     ordered = {name: float(values[name]) for name in COORDINATES if name in values}
-    return Goal(ordered, {name: float(tolerance.get(name, DEFAULT_TOLERANCE[name])) for name in ordered})
+    return Goal(ordered, {name: float((DEFAULT_TOLERANCE | tolerance)[name]) for name in ordered})

@@ -88,7 +88,7 @@ def _path_directions(scene: Scene, z, names: Sequence[str], combinations) -> lis
         return []
     # The normal and the tangential row of each contact, as if all rolled.
     capacity = 8 * -(-len(names) // 8)
-    padded = [*names, *names[:1] * (capacity - len(names))]
+    padded = [*names, *[names[0]] * (capacity - len(names))]
     every = contact_formation([f"{name} rolling" for name in padded])
     rows = np.asarray(_constraint_rows(rigid_body(scene.object), scene.hand, scene.gravity, every, jnp.asarray(z)))
     row_of = {name: rows[2 * k : 2 * k + 2] for k, name in enumerate(names)}

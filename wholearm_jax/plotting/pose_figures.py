@@ -6,7 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Polygon as Patch
-from shapely import LineString
+from shapely import LineString, Point
 from shapely import Polygon as ShapelyPolygon
 
 from wholearm_jax.model import Scene, rigid_body
@@ -76,7 +76,7 @@ def _mark_overlaps(scene: Scene, z, outline, segments, ax: Axes) -> None:
         if part.length > 0:
             ax.plot(*np.asarray(part.coords).T, color=ALARM, lw=4, zorder=5)
     crossing = first.intersection(second)
-    if crossing.geom_type == "Point" and not bool(scene.hand.layered):
+    if isinstance(crossing, Point) and not bool(scene.hand.layered):
         ax.plot(crossing.x, crossing.y, "x", color=ALARM, ms=9, mew=2, zorder=6)
     at = {"transform": ax.transAxes, "ha": "center", "va": "top", "fontsize": "x-small", "color": ALARM}
     ax.text(0.5, 0.0, "\n".join(lines), **at)

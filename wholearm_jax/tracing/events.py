@@ -117,7 +117,10 @@ def event_functions(mechanics: ScaledMechanics, target: PathTarget, z: Float[Arr
         gap=rows(every, none, none, 0.0, links.gap),
         along=rows(nothing, one, -one, 0.0, of_links),
         coordinate_weight=rows(nothing, none, none, jnp.where(until, -sense, 0.0), of_links),
-        joint_angle=tuple(rows(nothing, none, none, 0.0, weight) for weight in links.joint_angle),
+        joint_angle=(
+            rows(nothing, none, none, 0.0, links.joint_angle[0]),
+            rows(nothing, none, none, 0.0, links.joint_angle[1]),
+        ),
         shift=rows(flush_depth, -held.lower, held.upper, of_target, links.shift),
         coordinate=target.until_coordinate,
         lower=rows(pairs.lower, -far, -far, -jnp.inf, links.contacts.lower),
