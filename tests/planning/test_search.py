@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tomli_w
 from shapely import LineString, Polygon
+from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.files import load_goal, load_start
@@ -20,7 +21,7 @@ from wholearm_jax.planning.successors import successor_formations
 
 
 def part_data(name="heptagon"):
-    data = to_dict(wa.load(name))
+    data = to_dict(layered(name))
     data["hand"]["fingers"] = "coplanar"
     for finger in ("finger1", "finger2"):
         data["hand"][finger]["length"] = 0.13
