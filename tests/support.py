@@ -1,7 +1,6 @@
 """What tests of several folders share: scenes of layered hands, a torque that passes a path's end, differences."""
 
 import itertools
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -10,24 +9,15 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
+from benchmarks.layered_scenes import layered, layered_file
 from wholearm_jax.dynamics import evaluate, locate_panel
 from wholearm_jax.files import to_dict
 from wholearm_jax.margin import best_quasistatic_torque_batch
 from wholearm_jax.phases import has_torque_jumps, margin
 from wholearm_jax.simulation import IntegratorOptions
 
+__all__ = ["layered", "layered_file"]  # for the tests
 DURATION = 1.0
-LAYERED_SCENES = Path(__file__).parents[1] / "benchmarks" / "scenes"
-
-
-def layered_file(name: str) -> Path:
-    """The scene file of a plan whose fingers pass each other, in planes of their own; earlier numbers are its."""
-    return LAYERED_SCENES / f"{name}_layered.toml"
-
-
-def layered(name: str) -> wa.Scene:
-    """A plan whose fingers pass each other: `heptagon`, `hexagon`, `tipping`, `flight` or `passage`."""
-    return wa.load(layered_file(name))
 
 
 def passing(dynamics, knots=9):

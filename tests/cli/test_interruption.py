@@ -11,25 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.interruption import interrupt
 from wholearm_jax.cli.interruption import _is_being_written, exit_on_interrupt
 
 SOON = 1.0  # s, of a machine that does nothing else
 MOMENTS = [0.5, *(random.Random(7).uniform(1.0, 9.0) for _ in range(3))]
-
-
-def interrupted(command, moment, cache):
-    """Exit status, standard error and seconds of a command that gets SIGINT after `moment` seconds."""
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XDG_"))}
-    environment |= {"XDG_CACHE_HOME": str(cache)}
-    program = [sys.executable, "-m", "wholearm_jax", *command]
-    with subprocess.Popen(
-        program, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        time.sleep(moment)
-        process.send_signal(signal.SIGINT)
-        begun = time.perf_counter()
-        _, err = process.communicate(timeout=60)
-        return process.returncode, err, time.perf_counter() - begun
 
 
 def busy() -> float:
@@ -39,9 +25,8 @@ def busy() -> float:
 
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_ctrl_c_while_it_imports_traces_and_compiles(moment, tmp_path):
-    code, err, seconds = interrupted(
-        ["optimise", "heptagon", "--out", str(tmp_path / "out")], moment, tmp_path / "cache"
-    )
+    command = ["optimise", "heptagon", "--out", str(tmp_path / "out")]
+    code, err, seconds = interrupt(command, moment, tmp_path / "cache")
     assert code == 130, err
     assert err.splitlines()[-1] == "wholearm: interrupted"
     assert not re.search("Traceback|Fatal|Error|abort", err)

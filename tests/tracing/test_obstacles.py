@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import brentq, fsolve
+from scipy.optimize import brentq, root
 from support import layered, steadiest_difference
 
 import wholearm_jax as wa
@@ -50,7 +50,9 @@ def curve_point(scene, phi, guess):
         rows = [at[6, 1], normal1 @ (at[1] - hand.joint[0])]
         return rows + [normal2 @ (at[k] - hand.joint[1]) for k in (3, 4)]
 
-    x, y, theta1, theta2 = fsolve(gaps, np.asarray(guess)[[0, 1, 3, 4]], xtol=1e-14)
+    found = root(gaps, np.asarray(guess)[[0, 1, 3, 4]], tol=1e-14)
+    assert np.abs(found.fun).max() < 1e-15, found.message
+    x, y, theta1, theta2 = found.x
     return np.array([x, y, phi, theta1, theta2])
 
 

@@ -55,7 +55,7 @@ def _change_scene(scene, change: str):
     owner, _, field = key.rpartition(".")
     if owner == "start" and field in COORDINATES:
         start = np.array(scene.start)
-        start[COORDINATES.index(field)] = _read_coordinate(change, field, value)
+        start[COORDINATES.index(field)] = read_coordinate(f"--set {change}", field, value)
         return eqx.tree_at(lambda s: s.start, scene, as_device_array(start))
     until = owner.endswith(".until") and field in COORDINATES
     row = phase_number(scene, owner.removesuffix(".until") if until else owner)
@@ -64,7 +64,7 @@ def _change_scene(scene, change: str):
         others = "PHASE.until.COORDINATE=VALUE or start.COORDINATE=VALUE"
         raise BadInput(f"--set {change}: write PHASE.duration=SECONDS, {others}; phases: {names}")
     if until:
-        limit = path_target(None, {field: _read_coordinate(change, field, value)})
+        limit = path_target(None, {field: read_coordinate(f"--set {change}", field, value)})
         limits = limit.until_coordinate, limit.until_value
         return eqx.tree_at(lambda s: _until_of(s.phases[row]), scene, limits)
     try:
@@ -80,22 +80,23 @@ def _until_of(phase):
     return phase.target.until_coordinate, phase.target.until_value
 
 
-def _read_coordinate(change: str, coordinate: str, text: str) -> float:
-    """Read a coordinate's value: metres, radians or an angle with its unit."""
-    from wholearm_jax.files.angles import ANGLE_COORDINATES, ANGLE_HINT, is_beyond_a_turn, read_angle
+def read_coordinate(source: str, coordinate: str, text: str) -> float:
+    """Read a coordinate's value: metres, radians or an angle with its unit; `source` is what an error names."""
+    from wholearm_jax.files.angles import ANGLE_HINT, is_beyond_a_turn, read_angle
+    from wholearm_jax.model import ANGLE_COORDINATES
 
     is_angle = coordinate in ANGLE_COORDINATES
     try:
         number = float(text)
         if is_angle and is_beyond_a_turn(number):
-            note(f'--set {change}: {number:g} radians are more than a whole turn; degrees are written "{number:g} deg"')
+            note(f'{source}: {number:g} radians are more than a whole turn; degrees are written "{number:g} deg"')
     except ValueError:
         try:
             number = read_angle(text) if is_angle else float("nan")
         except ValueError:
             number = float("nan")
     if not abs(number) < float("inf"):
-        raise BadInput(f"--set {change}: {coordinate} is {ANGLE_HINT if is_angle else 'a number of metres'}")
+        raise BadInput(f"{source}: {coordinate} is {ANGLE_HINT if is_angle else 'a number of metres'}")
     return number
 
 

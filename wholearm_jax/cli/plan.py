@@ -12,6 +12,7 @@ from wholearm_jax.cli.arguments import (
     SceneName,
     make_output_folder,
     note,
+    read_coordinate,
     refuse_unwritable,
 )
 from wholearm_jax.cli.tables import Column, print_json, print_table
@@ -75,22 +76,14 @@ def _goal(name: str, own: dict[str, Any] | None, goal, by, tolerance) -> dict[st
 
 def _read(text: str, option: str) -> dict[str, float]:
     """Read `x=-0.03,phi=-40 deg`."""
-    from wholearm_jax.files.angles import ANGLE_COORDINATES, read_angle
     from wholearm_jax.model import COORDINATES
 
     values = {}
     for part in text.split(","):
         name, _, value = (piece.strip() for piece in part.partition("="))
-        try:
-            number = float(value)
-        except ValueError:
-            try:
-                number = read_angle(value) if name in ANGLE_COORDINATES else math.nan
-            except ValueError:
-                number = math.nan
-        if name not in COORDINATES or not math.isfinite(number):
+        if name not in COORDINATES:
             raise BadInput(f"{option} {text}: write coordinates and values such as x=-0.03,phi=-40 deg")
-        values[name] = number
+        values[name] = read_coordinate(f"{option} {text}", name, value)
     return values
 
 

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-ANGLE_COORDINATES = ("phi", "theta1", "theta2")
+from wholearm_jax.model import ANGLE_COORDINATES
+
 ANGLE_HINT = "a number of radians or a text such as '-40 deg'"
 _UNITS = {"deg": math.pi / 180, "°": math.pi / 180, "degree": math.pi / 180, "degrees": math.pi / 180, "rad": 1.0}
 _TEXT = re.compile(r"\s*(?P<number>[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?)\s*(?P<unit>[a-z°]+)\s*")

@@ -27,6 +27,7 @@ from wholearm_jax.model import (
     contact_formation,
     path_target,
     polygon,
+    resting_angle,
     resting_configuration,
 )
 
@@ -82,12 +83,11 @@ def load_goal(name: str | Path) -> dict[str, Any] | None:
     if goal.on is not None:
         if "phi" in values or "phi" in goal.by:
             raise SceneError(f"{name}: goal.on: the edge fixes phi; leave phi out")
-        vertices = np.asarray(load_start(name).object.vertices)
-        edge, count = int(goal.on[1:]), len(data["object"]["vertices"])
-        if edge >= count:
-            raise SceneError(f"{name}: goal.on: the object has edges 0 to {count - 1}")
-        along = vertices[(edge + 1) % count] - vertices[edge]
-        values["phi"] = -float(np.arctan2(along[1], along[0]))
+        shape = load_start(name).object
+        try:
+            values["phi"] = resting_angle(np.asarray(shape.vertices)[: int(shape.count)], int(goal.on[1:]))
+        except ValueError as error:
+            raise SceneError(f"{name}: goal.on: {error}") from None
     return {"goal": values, "by": dict(goal.by), "tolerance": dict(goal.tolerance)}
 
 

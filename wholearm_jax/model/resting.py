@@ -23,10 +23,7 @@ def resting_configuration(shape: Polygon, hand: Hand, edge: int, x: float) -> np
     body = rigid_body(shape)
     count = int(body.count)
     corners = np.asarray(body.vertices)[:count]
-    if not 0 <= edge < count:
-        raise ValueError(f"e{edge}: the object has edges 0 to {count - 1}")
-    begin, end = corners[edge], corners[(edge + 1) % count]
-    phi = -np.arctan2(end[1] - begin[1], end[0] - begin[0])
+    phi = resting_angle(corners, edge)
     turn = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]])
     at = corners @ turn.T
     height = -at[edge, 1]
@@ -38,6 +35,19 @@ def resting_configuration(shape: Polygon, hand: Hand, edge: int, x: float) -> np
         if angle is None:
             raise ValueError(f"e{edge} at x = {x:.4g} m: finger{finger + 1} does not reach the object")
     return np.array([x, height, phi, *angles], float)
+
+
+def resting_angle(corners: np.ndarray, edge: int) -> float:
+    """Return the angle `phi` [rad] at which an edge of a polygon `(count, 2)` lies down on the palm.
+
+    Raises:
+        ValueError: if the polygon has no such edge.
+    """
+    count = len(corners)
+    if not 0 <= edge < count:
+        raise ValueError(f"e{edge}: the object has edges 0 to {count - 1}")
+    along = corners[(edge + 1) % count] - corners[edge]
+    return -float(np.arctan2(along[1], along[0]))
 
 
 def _closing_angle(corners: np.ndarray, hand: Hand, finger: int) -> float | None:

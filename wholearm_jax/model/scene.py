@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from wholearm_jax.core import as_device_array
 
 COORDINATES = ("x", "y", "phi", "theta1", "theta2")
+ANGLE_COORDINATES = ("phi", "theta1", "theta2")
 LINKS = ("palm", "finger1", "finger2")
 FLUSH_TOLERANCE = 1e-6  # [m]
 VERTEX, EDGE = 0, 1  # contact types: A, an object vertex on a link; B, a fingertip on an object edge

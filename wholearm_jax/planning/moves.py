@@ -13,17 +13,15 @@ from wholearm_jax.core import CachedJit, Status
 from wholearm_jax.dynamics import evaluate, locate_panel
 from wholearm_jax.margin import best_quasistatic_torque
 from wholearm_jax.model import (
-    COORDINATES,
     ContactFormation,
     Scene,
-    constraint_jacobian,
     contact_formation,
     path_target,
     rigid_body,
-    scaled_mechanics,
 )
 from wholearm_jax.phases import trace_phase
-from wholearm_jax.planning.successors import MIN_PATH_LENGTH, WEDGING_CONDITION, formation_names, touching_contacts
+from wholearm_jax.planning.path_choices import path_choices
+from wholearm_jax.planning.successors import MIN_PATH_LENGTH, touching_contacts
 from wholearm_jax.tracing import Resolution
 
 MOVES_PER_CALL = 8  # paths that one call of the program traces; the last call is filled up
@@ -63,13 +61,7 @@ def moves_from(scene: Scene, z: Float[Array, "5"], touching: Sequence[str] | Non
         touching: the contacts to combine; those that touch at `z` unless given.
     """
     names = touching_contacts(scene, z) if touching is None else touching
-    combinations = tuple(formation_names(names, rolling=True))
-    chosen = [
-        (contacts, COORDINATES[int(np.argmax(np.abs(direction)))] + sign)
-        for contacts, direction in zip(combinations, _path_directions(scene, z, names, combinations), strict=True)
-        if direction is not None
-        for sign in "-+"
-    ]
+    chosen = [*path_choices(scene, z, names, rolling=True)]
     moves = []
     for first in range(0, len(chosen), MOVES_PER_CALL):
         part = chosen[first : first + MOVES_PER_CALL]
@@ -80,33 +72,6 @@ def moves_from(scene: Scene, z: Float[Array, "5"], touching: Sequence[str] | Non
                 ends = int(row.end_reason), int(row.end_contact)
                 moves.append(Move(contacts, toward, float(row.length), row.places, row.margins, *ends))
     return tuple(moves)
-
-
-def _path_directions(scene: Scene, z, names: Sequence[str], combinations) -> list[np.ndarray | None]:
-    """Return the direction of each combination's path in the object's units; None where constraints depend."""
-    if not combinations:
-        return []
-    # The normal and the tangential row of each contact, as if all rolled.
-    capacity = 8 * -(-len(names) // 8)
-    padded = [*names, *[names[0]] * (capacity - len(names))]
-    every = contact_formation([f"{name} rolling" for name in padded])
-    rows = np.asarray(_constraint_rows(rigid_body(scene.object), scene.hand, scene.gravity, every, jnp.asarray(z)))
-    row_of = {name: rows[2 * k : 2 * k + 2] for k, name in enumerate(names)}
-    stacked = np.stack(
-        [
-            np.concatenate([row_of[name.partition(" ")[0]][: 1 + name.endswith("rolling")] for name in contacts])
-            for contacts in combinations
-        ]
-    )
-    _, values, right = np.linalg.svd(stacked)
-    independent = values[:, -1] > WEDGING_CONDITION * values[:, 0]
-    return [right[k, 4] if independent[k] else None for k in range(len(combinations))]
-
-
-@CachedJit
-def _constraint_rows(body, hand, gravity, formation, z):
-    mechanics = scaled_mechanics(body, hand, gravity, formation)
-    return constraint_jacobian(mechanics.contacts, z / mechanics.configuration_unit)
 
 
 @functools.lru_cache(maxsize=4096)

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from wholearm_jax.core import CachedJit, Status, as_device_array, require_x64
 from wholearm_jax.margin import margin_upper_bound
-from wholearm_jax.model import COORDINATES, Phase, Scene, contact_formation, path_target, rigid_body
+from wholearm_jax.model import ANGLE_COORDINATES, COORDINATES, Phase, Scene, contact_formation, path_target, rigid_body
 from wholearm_jax.phases import describe_end, trace
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import Move, moves_from
@@ -190,7 +190,9 @@ def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tup
 
 def _phases_to_go(search: _Search, z: np.ndarray) -> float:
     """Estimate how many moves lead from a configuration to the goal; 0 within its tolerances."""
-    sizes = [TYPICAL_TURN if name[0] in "pt" else TYPICAL_SHIFT * search.radius for name in search.goal.values]
+    sizes = [
+        TYPICAL_TURN if name in ANGLE_COORDINATES else TYPICAL_SHIFT * search.radius for name in search.goal.values
+    ]
     tolerances = np.array([search.goal.tolerance[name] for name in search.goal.values])
     return float((np.maximum(search.goal.distance(z) - tolerances, 0.0) / sizes).sum())
 
@@ -273,7 +275,9 @@ def _explain(search: _Search, nearest: Plan | None, *, out_of_time: bool) -> str
     z = nearest.ends[-1] if nearest is not None else search.start
     missing = search.goal.distance(z)
     parts = [
-        f"{name} is off by {np.degrees(d):.3g} deg" if name[0] in "pt" else f"{name} is off by {1e3 * d:.3g} mm"
+        f"{name} is off by {np.degrees(d):.3g} deg"
+        if name in ANGLE_COORDINATES
+        else f"{name} is off by {1e3 * d:.3g} mm"
         for name, d in zip(search.goal.values, missing, strict=True)
         if d > search.goal.tolerance[name]
     ]

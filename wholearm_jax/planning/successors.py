@@ -5,8 +5,7 @@ configuration, and two ways along it; a way that would push another touching con
 out. What remains is what a plan can do next.
 """
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -17,13 +16,11 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.core import Status, as_device_array, require_x64
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel, resolve_impact
-from wholearm_jax.margin import MAX_ROLLING, MarginBound, best_quasistatic_torque, margin_upper_bound
+from wholearm_jax.margin import MarginBound, best_quasistatic_torque, margin_upper_bound
 from wholearm_jax.model import (
-    COORDINATES,
     LINKS,
     Phase,
     Scene,
-    constraint_jacobian,
     contact_candidates,
     contact_formation,
     contact_kinematics,
@@ -33,11 +30,11 @@ from wholearm_jax.model import (
     scaled_mechanics,
 )
 from wholearm_jax.phases import IMPULSE_ROUNDING, TracedPhase, describe_end, trace_phase
+from wholearm_jax.planning.path_choices import path_choices
 from wholearm_jax.tracing import Resolution
 
 CONTACT_TOL = 1e-7  # gap, in the object's radius, below which a contact touches
 MIN_PATH_LENGTH = 1e-3  # wire length, in the object's radius, below which a way leads nowhere
-WEDGING_CONDITION = 1e-6  # share of the largest entry below which four contacts do not fix a wire
 
 
 @dataclass(frozen=True)
@@ -133,41 +130,13 @@ def successor_formations(
     require_x64(scene, z)
     contacts = touching_contacts(scene, z) if touching is None else touching
     successors = []
-    for names in formation_names(contacts, rolling):
+    for names, toward in path_choices(scene, z, contacts, rolling=rolling):
         formation = contact_formation(names)
-        tangent = path_direction(scene, z, formation)
-        if tangent is None:
-            continue
         lists_failures = touching is None and not bool(np.any(formation.tangential))
-        steepest = int(np.argmax(np.abs(tangent)))
-        for sign in ("-", "+"):
-            successor = _successor(scene, z, z_dot, names, formation, COORDINATES[steepest] + sign)
-            if successor is not None and (successor.status is Status.OK or lists_failures):
-                successors.append(successor)
+        successor = _successor(scene, z, z_dot, names, formation, toward)
+        if successor is not None and (successor.status is Status.OK or lists_failures):
+            successors.append(successor)
     return tuple(sorted(successors, key=lambda successor: -successor.static))
-
-
-def formation_names(contacts: Sequence[str], rolling: bool) -> Iterator[tuple[str, ...]]:
-    """Yield the combinations of contacts with four constraints: one for a sliding contact, two for a rolling one."""
-    yield from itertools.combinations(contacts, 4)
-    for count in range(1, MAX_ROLLING + 1) if rolling else ():
-        for rolls in itertools.combinations(contacts, count):
-            others = [name for name in contacts if name not in rolls]
-            for slides in itertools.combinations(others, 4 - 2 * count):
-                yield *(f"{name} rolling" for name in rolls), *slides
-
-
-def path_direction(scene, z, formation):
-    """Return the path's direction in the object's units, or None where the constraints do not fix one."""
-    rows = np.asarray(_constraint_rows(scene, z, formation))
-    _, values, right = np.linalg.svd(rows)
-    return right[4] if values[-1] > WEDGING_CONDITION * values[0] else None
-
-
-@eqx.filter_jit
-def _constraint_rows(scene, z, formation):
-    mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, formation)
-    return constraint_jacobian(mechanics.contacts, z / mechanics.configuration_unit)
 
 
 def _successor(scene, z, z_dot, names, chosen, toward: str) -> Successor | None:

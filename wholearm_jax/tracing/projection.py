@@ -6,7 +6,7 @@ Derivation: section 3 of `docs/derivation.md`.
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import eps_power, fused_matmul, solve, take_row
 from wholearm_jax.model import PathTarget, ScaledMechanics, constraint_jacobian, constraints, contact_kinematics
@@ -50,7 +50,10 @@ def project_onto_path(mechanics: ScaledMechanics, initial_guess: Float[Array, "5
 
 
 def settle_on_link(
-    mechanics: ScaledMechanics, start: Float[Array, "5"], tangent: Float[Array, "5"]
+    mechanics: ScaledMechanics,
+    start: Float[Array, "5"],
+    tangent: Float[Array, "5"],
+    may_settle: bool | Bool[Array, ""] = True,
 ) -> tuple[Float[Array, "5"], Float[Array, "5"]]:
     """Move a start at which a vertex lies a little behind a link along the path until it touches.
 
@@ -60,6 +63,7 @@ def settle_on_link(
         mechanics: the formation in object units.
         start: a configuration on the path (5,).
         tangent: the unit tangent there (5,).
+        may_settle: whether the start may be moved.
 
     Returns:
         The configuration and tangent; as given where no vertex is between the tolerance for flush ones and
@@ -67,9 +71,9 @@ def settle_on_link(
     """
     fixed, fixed_start = stop_gradient((mechanics, start))
     pairs, at = fixed.candidates, contact_kinematics(fixed.candidates, fixed_start)
-    may_settle = fixed.may_terminate & pairs.on_link & ~fixed.may_be_behind
+    is_watched = fixed.may_terminate & pairs.on_link & ~fixed.may_be_behind
     inside = (at.along > pairs.lower) & (at.along < pairs.upper)
-    depth = jnp.where(may_settle & inside, -at.gap, 0.0)
+    depth = jnp.where(is_watched & inside, -at.gap, 0.0)
     row, deepest = jnp.argmax(depth), depth.max()
 
     def gap(mechanics, z, x):
@@ -84,7 +88,7 @@ def settle_on_link(
     lies_behind = (deepest > jnp.maximum(fixed.flush_tolerance, eps_power(start, 5 / 8))) & (
         deepest < MAX_SETTLING_DEPTH
     )
-    return jax.lax.cond(lies_behind, settle, lambda: (start, tangent))
+    return jax.lax.cond(may_settle & lies_behind, settle, lambda: (start, tangent))
 
 
 def orient_tangent(tangent: Float[Array, "5"], target: PathTarget) -> Float[Array, "5"]:

@@ -64,8 +64,7 @@ def trace_path(
 
     # Project, follow the curve, locate its end and kinks.
     start, residual, tangent = project_onto_path(mechanics, initial_guess)
-    settled = settle_on_link(mechanics, start, tangent)
-    start, tangent = (jnp.where(may_settle, a, b) for a, b in zip(settled, (start, tangent), strict=True))
+    start, tangent = settle_on_link(mechanics, start, tangent, may_settle)
     tangent = orient_tangent(tangent, fixed_target)
     events = event_functions(mechanics, target, stop_gradient(start))
     fixed_start, fixed_events = stop_gradient((start, events))
