@@ -270,7 +270,11 @@ def test_what_passes_and_comes_back_within_a_step_is_met_on_its_way_down(side):
     """A vertex that grazes a finger, or its back: it dips through soon, and is back to rounding where the step ends."""
     lower, upper = jnp.array([0.0, -jnp.inf]), jnp.array([1.0, jnp.inf])
     watch = SimpleNamespace(
-        lower=lower, upper=upper, is_terminal=jnp.array([True, True]), may_start_negative=jnp.array([True, False])
+        lower=lower,
+        upper=upper,
+        is_terminal=jnp.array([True, True]),
+        two_sided=jnp.array([True, False]),
+        half_width=jnp.zeros(2),
     )
     step, inside = 2e-3, jnp.array([0.5, 0.0])
     gap = np.polynomial.Polynomial.fromroots([0.3 * step, 0.999999 * step])
