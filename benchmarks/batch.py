@@ -2,7 +2,7 @@ r"""Many scenes: how many a second one schedule is checked against, and what lim
 
     python benchmarks/batch.py [--quick]
 
-The heptagon's whole plan (two phases, 2 s), every wire traced anew, vertices within 0.2 mm and friction within 10 %, in
+The heptagon's whole plan (two phases, 2 s), every path traced anew, vertices within 0.2 mm and friction within 10 %, in
 one process with a device for each processor: checks over the size of the batch, on one device as well, beside what two
 gain for arithmetic alone; checks of the first phase alone (1 s); checks of objects that differ in friction and mass
 alone; checks with the gradient of the margin with respect to all torques, optimisations, one process against two, the
@@ -104,7 +104,7 @@ def scaling(ensemble, torque) -> dict:
 
 
 def same_geometry(torque) -> dict:
-    """Checks of objects that differ in friction and mass alone: their wires are one another's."""
+    """Checks of objects that differ in friction and mass alone: their paths are one another's."""
     ensemble = make_ensemble(layered("heptagon"), {"mass": "5%", "friction": "10%"}, seed=1)
     wa.check(ensemble, torque, count=BLOCK, arrival=ARRIVAL)
     begun = time.perf_counter()

@@ -2,9 +2,9 @@ r"""Direct collocation of one phase with CasADi and IPOPT: what `wholearm_jax.op
 
     python benchmarks/collocation.py [--duration SECONDS]
 
-The same problem on the same tabulated wire: from rest at the wire's start to rest at its end in a fixed duration `T`,
+The same problem on the same tabulated path: from rest at the path's start to rest at its end in a fixed duration `T`,
 torques linear between evenly spaced knots and within their limits, the least contact force as large as it can be. Time
-is a share `u` of `T`, place a share `p` of the wire's length `L`, and `w = dp/du`:
+is a share `u` of `T`, place a share `p` of the path's length `L`, and `w = dp/du`:
 
     maximise m   subject to   dp/du = w,   dw/du = (T^2/L) (A0 + A3 tau1 + A4 tau2) + T A2 w + L A1 w^2,
                               F0 + F1 (L w/T)^2 + F2 (L w/T) + F3 tau1 + F4 tau2 >= m,   |tau| <= limit,   w >= 0
@@ -12,7 +12,7 @@ is a share `u` of `T`, place a share `p` of the wire's length `L`, and `w = dp/d
 with `A` and `F` the coefficients of `wholearm_jax.dynamics.path_dynamics.PathDynamics`. States are cubics on each
 interval that satisfy the
 equation of motion at Radau's three points; forces count at these points and at the start. Each smooth piece of the
-wire enters as one Chebyshev series for every coefficient, refitted from the table to 1e-10, so that IPOPT sees smooth
+path enters as one Chebyshev series for every coefficient, refitted from the table to 1e-10, so that IPOPT sees smooth
 functions and exact second derivatives.
 
 Where a slip reverses, `A` and `F` jump at a known place but at an unknown time. The interval in which the motion
@@ -52,7 +52,7 @@ CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 class Piece(NamedTuple):
-    """A smooth piece of a wire: from `low` to `high` in shares of its length, speeds scaled by `speed_ratio` on entry.
+    """A smooth piece of a path: from `low` to `high` in shares of its length, speeds scaled by `speed_ratio` on entry.
 
     `series[k, j]` is Chebyshev coefficient `k` of function `j`: `A0 ... A4`, then `F0 ... F4` of each contact.
     """
@@ -63,7 +63,7 @@ class Piece(NamedTuple):
     series: np.ndarray
 
 
-class Wire(NamedTuple):
+class PathSeries(NamedTuple):
     """What the transcription needs of a `wholearm_jax` table."""
 
     segments: tuple[Piece, ...]
@@ -87,8 +87,8 @@ class Collocated:
 
     `course.plan_margin` [N] is the least force at the collocation points, `ipopt` its status. `margin` [N] and
     `assessment` are
-    those of the honest simulation of `torque` (knots x 2, N m); `missed` is the distance to the wire's end that it
-    leaves and `speed` the speed, in wire lengths and in these a duration. It took `solves` solves, `iterations` in all,
+    those of the honest simulation of `torque` (knots x 2, N m); `missed` is the distance to the path's end that it
+    leaves and `speed` the speed, in path lengths and in these a duration. It took `solves` solves, `iterations` in all,
     in `seconds` seconds (the best of them alone in `best_solve`) after `build` seconds of building. Of the
     `initial_guesses`
     tried one after the other only `spent` counts all, in seconds.
@@ -116,9 +116,9 @@ class Collocated:
 
     @property
     def nearly(self) -> bool:
-        """Whether it would succeed if arriving within a thousandth of the wire, at 5 % of the mean speed, were enough.
+        """Whether it would succeed if arriving within a thousandth of the path, at 5 % of the mean speed, were enough.
 
-        The package itself asks for a millionth of the wire and 0.35 % (`wholearm_jax.phases.assessment`).
+        The package itself asks for a millionth of the path and 0.35 % (`wholearm_jax.phases.assessment`).
         """
         return self.ipopt in CONVERGED and self.margin > 0 and self.missed < 1e-3 and self.speed < 0.05
 
@@ -161,10 +161,10 @@ def best_known(dynamics: PathDynamics, duration: float, coarse: Collocated, *, e
     return max(found, key=lambda one: (one.succeeded, one.margin))
 
 
-# --- the wire as smooth functions -------------------------------------------------------------------------------------
+# --- the path as smooth functions -------------------------------------------------------------------------------------
 
 
-def read(dynamics: PathDynamics) -> Wire:
+def read(dynamics: PathDynamics) -> PathSeries:
     """One Chebyshev series a piece, of the degree that reproduces the table's polynomials to `FIT`."""
     count = int(dynamics.count)
     breaks = np.asarray(dynamics.breakpoints)[: count + 1]
@@ -172,7 +172,7 @@ def read(dynamics: PathDynamics) -> Wire:
     segments = [
         Piece(shares[k], shares[k + 1], float(dynamics.speed_ratio[k]), _series(dynamics, k)) for k in range(count)
     ]
-    return Wire(tuple(segments), float(dynamics.length), np.asarray(dynamics.torque_limit))
+    return PathSeries(tuple(segments), float(dynamics.length), np.asarray(dynamics.torque_limit))
 
 
 def _series(dynamics: PathDynamics, segment: int) -> np.ndarray:
@@ -207,7 +207,7 @@ def _evaluate(tables: np.ndarray, x: np.ndarray) -> np.ndarray:
 class Phase(NamedTuple):
     """What is to be solved: `duration` [s], `knots` torques a joint, `refine` collocation intervals between two."""
 
-    path: Wire
+    path: PathSeries
     duration: float
     knots: int
     refine: int
@@ -220,7 +220,7 @@ class Phase(NamedTuple):
 class Part(NamedTuple):
     """A stretch of time with its own cubic: in interval `row`, on `segment`, from `begin` to `end` in intervals.
 
-    `begin` and `end` are numbers, or variables where a piece of the wire ends within the interval.
+    `begin` and `end` are numbers, or variables where a piece of the path ends within the interval.
     """
 
     row: int
@@ -245,7 +245,7 @@ class Programme(NamedTuple):
 
 
 def _programme(phase: Phase, rows: tuple[int, ...], options: dict[str, Any]) -> Programme:
-    """The transcription of a phase whose motion leaves the wire's piece `k` in interval `rows[k]`."""
+    """The transcription of a phase whose motion leaves the path's piece `k` in interval `rows[k]`."""
     tau, splits, least = ca.MX.sym("tau", 2, phase.knots), ca.MX.sym("splits", len(rows)), ca.MX.sym("m")
     parts = _parts(phase, rows, splits)
     states = ca.MX.sym("states", 2, DEGREE * len(parts))
@@ -334,7 +334,7 @@ def _motion(phase: Phase, segment: Piece) -> ca.Function:
 
 
 def _coefficients(segment: Piece, share: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """`A` (5) and `F` (contacts x 5) at a share of the wire."""
+    """`A` (5) and `F` (contacts x 5) at a share of the path."""
     x = (2 * share - segment.low - segment.high) / (segment.high - segment.low)
     terms = [ca.SX(1), x]
     while len(terms) < len(segment.series):

@@ -24,7 +24,7 @@ from wholearm_jax.files import to_dict
 from wholearm_jax.model import Arrival, Phase, contact_formation, path_target
 from wholearm_jax.planning import Successor, exit_velocity, successor_formations
 
-SHORTEST, LEAST_BOUND, SLOWED = 0.2, 0.2, 0.2  # wire [object radii], bound [N], speed after an impact over that before
+SHORTEST, LEAST_BOUND, SLOWED = 0.2, 0.2, 0.2  # path [object radii], bound [N], speed after an impact over that before
 
 
 def flying_plans(count: int, seed: int = 0, *, phases: int = 3, pace: float = 0.4) -> tuple[wa.Scene, ...]:

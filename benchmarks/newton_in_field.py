@@ -2,13 +2,13 @@ r"""The direct way, to compare with: the C-functions are solved by Newton's meth
 
 State `(s, w)` as in `wholearm_jax.simulation.phase_motion`; at every stage of every step
 
-    C_n(z) = 0,  u . z = s            Newton's method, from the nearest of a few places known on the wire,
-    G_n x = 0,  u . x = 1             the wire's tangent, and its derivative x',
+    C_n(z) = 0,  u . z = s            Newton's method, from the nearest of a few places known on the path,
+    G_n x = 0,  u . x = 1             the path's tangent, and its derivative x',
     [ M x , -(G_n - Xi U G_t)^T ] [a ; c_n] = E tau + g - M x' v^2 - B x v - D sgn(x v)
 
-and nothing is tabulated. Torque knots, slip reversals and the wire's end are treated as the package treats them, so
+and nothing is tabulated. Torque knots, slip reversals and the path's end are treated as the package treats them, so
 that the order is kept: steps end on knots, and the step that passes a reversal is taken again with the length that
-lands on it. Where they lie on the wire is given for free; waiting and friction at rest are left out.
+lands on it. Where they lie on the path is given for free; waiting and friction at rest are left out.
 """
 
 from typing import NamedTuple
@@ -25,11 +25,11 @@ from wholearm_jax.dynamics import PathDynamics, equations_of_motion, evaluate, l
 from wholearm_jax.model import PhaseSchedule, ScaledMechanics, interval, torque_at
 from wholearm_jax.tracing import ContactPath, path_derivatives, solve_on_path
 
-PLACES = 33  # known places of the wire: Newton's method starts within a sixty-fourth of its length
+PLACES = 33  # known places of the path: Newton's method starts within a sixty-fourth of its length
 
 
 class Direct(eqx.Module):
-    """What the direct way knows of a wire: its chart, signs, where its pieces end, and a few places to start from."""
+    """What the direct way knows of a path: its chart, signs, where its pieces end, and a few places to start from."""
 
     mechanics: ScaledMechanics
     chart: Float[Array, "5"]
@@ -51,10 +51,10 @@ class Path(NamedTuple):
 
 
 def direct(mechanics: ScaledMechanics, path: ContactPath, dynamics: PathDynamics) -> Direct:
-    """The direct way's view of a wire of one chart."""
+    """The direct way's view of a path of one chart."""
     segments = int(dynamics.count)
     if not np.all(np.asarray(path.chart[:segments]) == np.asarray(path.chart[0])):
-        raise ValueError("the direct way is written for wires of one chart")
+        raise ValueError("the direct way is written for paths of one chart")
     s = jnp.linspace(path.breakpoints[0], path.breakpoints[segments], PLACES)
 
     def place(s):
@@ -93,7 +93,7 @@ def solve(way: Direct, segment, s, w, tau, duration):
 def move(
     way: Direct, phase_schedule: PhaseSchedule, duration, solver: dfx.AbstractSolver, tolerance, max_steps: int
 ) -> Path:
-    """Move from rest at the wire's start to its end or to the end of time."""
+    """Move from rest at the path's start to its end or to the end of time."""
     share, y = jnp.zeros(()), jnp.stack([way.breakpoints[0], jnp.zeros(())])
     steps, counts = [], []
     for segment in range(way.slip_sign.shape[0]):

@@ -3,7 +3,7 @@ r"""A hand-written loop over a wire's table: what simulating one phase costs wit
     ds/du = w,    dw/du = T^2 (A0 + A3 tau1 + A4 tau2) + T A2 w + A1 w^2
 
 by an embedded Runge-Kutta method of any tableau with diffrax's default step control. Steps end on the torque's knots
-and land on a piece's end (a slip reversal, the wire's end) by Newton's method on the last step's length. The object
+and land on a piece's end (a slip reversal, the path's end) by Newton's method on the last step's length. The object
 starts moving and must not turn back: waiting, friction at rest and every check of the package are left out.
 """
 
@@ -64,7 +64,7 @@ def arrays(dynamics, phase_schedule) -> tuple[np.ndarray, ...]:
 
 
 def move(given, duration: float, method: Tableau, tolerance: float, max_steps: int = 4096) -> Motion:
-    """Simulate one phase from rest at the wire's start (`as_strong_array` by `arrays`)."""
+    """Simulate one phase from rest at the path's start (`as_strong_array` by `arrays`)."""
     nodes = np.empty((max_steps + 1, 3))
     count, evaluations = loop(given, duration, method, tolerance, nodes)
     return Motion(nodes, count, evaluations)

@@ -216,7 +216,7 @@ def _references() -> dict[str, dict[str, float | None]]:
 
 
 def _recalled(stored, key: str, bound: float) -> float | None:
-    """A reference [N], unless there is none or it belongs to another wire."""
+    """A reference [N], unless there is none or it belongs to another path."""
     one = stored.get(key)
     same = one is not None and abs(one["bound"] - bound) <= 1e-6 * abs(bound)
     return one["margin"] if same else None

@@ -7,15 +7,15 @@ Plans of two phases (`random_plans`) get optimised and quasi-static torques in t
 get optimised torques. These are then spoiled. A *squeeze* adds torques along the one direction that leaves the motion
 as it is, as many as move the predicted least force to a place drawn evenly on both sides of zero. A *push* adds torques
 along the other direction, so that the object falls short. Variants are drawn until a plan has two that are predicted to
-hold and two to fail, or the draws are used up. Left out is one that is predicted to reach a wire's end early, and at
+hold and two to fail, or the draws are used up. Left out is one that is predicted to reach a path's end early, and at
 speed: its plan says nothing about the impact that follows; and one in which a phase that others follow ends more than
-`PASSED` short of its wire, but within the tolerance: the next formation's contacts are open there.
+`PASSED` short of its path, but within the tolerance: the next formation's contacts are open there.
 
 What counts, by the same tolerances on both sides:
 
 - *predicted to hold*: no contact force is tensile for `FREE` running while its phase lasts (`MARGIN_OF_TIME` at either
   end left out), no impulse pulls, no hold is infeasible, and every phase ends within `TOLERANCE` (0.5 mm, 0.01 rad) of
-  its wire's end;
+  its path's end;
 - *executed to hold*: `execution.execute` at 0.05 ms ends `ok` (within the same tolerance, the last contacts closed to
   0.5 mm), where a phase should end at rest the object is within the tolerance, and no contact of a formation was open
   for `FREE` running, its phase's ends left out alike. Open is a gap of more than `OPEN`: where forces settle anew, as
@@ -60,18 +60,18 @@ TOLERANCE = Tolerance()
 FREE = 5e-3  # [s] for which a lost contact is tensile, or open; shorter is chatter of the contact's softness
 OPEN = 2e-6  # [m] gap above which an executed contact is open
 MARGIN_OF_TIME = 0.02  # [s] at either end of a phase, while formations change, in which forces are not judged
-PASSED = 0.02  # distance from its wire's end, over the tolerance, within which a phase that others follow reached it
-HURRY, EARLY = 0.1, 0.05  # speed over the mean speed, and share of the phase left, with which a wire's end is too early
+PASSED = 0.02  # distance from its path's end, over the tolerance, within which a phase that others follow reached it
+HURRY, EARLY = 0.1, 0.05  # speed over the mean speed, and share of the phase left, with which a path's end is too early
 SLOW = 0.02  # speed over the mean speed below which an object counts as at rest
 PAUSE = 0.1  # [s] for which a pausing plan holds the object
 EACH, DRAWS = 2, 12  # variants of each kind, and draws, a plan
 PUSHES = 0.25  # share of the draws that push
-SHORT = (0.03, 0.3)  # share of its wire by which a pushed object falls short, about
+SHORT = (0.03, 0.3)  # share of its path by which a pushed object falls short, about
 CLEAR = 0.05  # distance of the margin from zero, over the mean contact force, from which it is clear
 DIP = 0.02  # [s] of tensile force below which a loss is a short dip
 NEAR = (0.5, 2.0)  # distances from the planned end, over the tolerance, that are near the limit
 NUDGE = 1e-3  # change of all torques that moves the end of a sensitive plan by more than the tolerance
-LAST = 0.03  # share of a phase that is its wire's end
+LAST = 0.03  # share of a phase that is its path's end
 AROUND, KICK = 0.01, 0.01  # [s] before and after an impact, and share of the speed by which it is off, that count
 UNIT = np.array([0.04, 0.04, 1.0, 1.0, 1.0])  # of configurations: the objects' radius, about [m], and radians
 PLACES = 1001  # samples a phase
@@ -194,7 +194,7 @@ def _arrives(phase, course, last: bool) -> bool | None:
     """Whether a phase ends where it should; None where its plan does not say what follows.
 
     That is so where it comes to its end too early, and where it stops just short, or is late, and others follow: the
-    model begins the next phase where its wire begins, and the object is not there yet.
+    model begins the next phase where its path begins, and the object is not there yet.
     """
     motion = phase.outcome.motion
     ended, length = Status(int(motion.status)), float(phase.traced.dynamics.length)
@@ -398,7 +398,7 @@ def explain(predicted: Predicted, found: dict, finer: dict) -> str:
     if abs(predicted.margin) < CLEAR * predicted.mean:
         return "margin within 5 % of the mean force of zero"
     if lost and (predicted.place > 1 - LAST or predicted.place < LAST):
-        return "at the wire's end"
+        return "at the path's end"
     apart = max(found["position_error"] / TOLERANCE.position, found["angle_error"] / TOLERANCE.angle, found["off"])
     if not lost and NEAR[0] <= max(predicted.off, apart) <= NEAR[1]:
         return "the end is near the tolerance's limit"

@@ -3,7 +3,7 @@
     python benchmarks/random_plans.py --count 12 --out DIR
 
 A polygon is laid with one edge on the palm and both fingers are closed until each touches a vertex: four contacts,
-whose wire is followed either way. Where it ends a fifth contact is made; giving up one of the old four leaves the
+whose path is followed either way. Where it ends a fifth contact is made; giving up one of the old four leaves the
 next formation. A plan is kept when every phase can be traced, is of real length, and has a bound
 (`wholearm_jax.bounds`) that is clearly positive: some torque can hold it everywhere. Whether one torque schedule can is
 left to the optimisers.
@@ -125,7 +125,7 @@ def _closed(points: np.ndarray, finger: dict[str, Any], number: int) -> tuple[in
     return (vertex if reached else None), float(angle[vertex])
 
 
-# --- plans: wires that can be followed and held -----------------------------------------------------------------------
+# --- plans: paths that can be followed and held -----------------------------------------------------------------------
 
 
 def _plan(data: dict[str, Any], contacts: list[str], phases: int, duration: float) -> dict[str, Any] | None:

@@ -50,7 +50,7 @@ def scored(dynamics, phase_schedule, duration):
 
 @partial(jax.jit, static_argnames="stop")
 def bare(dynamics, phase_schedule, duration, stop=False):
-    """One stage on the wire's first piece; `stop` looks for the first tensile force at every step's end."""
+    """One stage on the path's first piece; `stop` looks for the first tensile force at every step's end."""
 
     def field(u, y, _):
         tau = torque_at(phase_schedule, interval(phase_schedule, u), u)
@@ -111,7 +111,7 @@ def rows(problem, repeats: int) -> list[dict]:
     motion = moved(dynamics, phase_schedule, duration)
     gradient = jax.jit(jax.value_and_grad(lambda v: _margin(dynamics, phase_schedule, duration, v)))
     calls = {
-        "tracing, when the wire is known": (
+        "tracing, when the path is known": (
             lambda: (prepared(Resolution()), scored(dynamics, phase_schedule, duration)),
             "margin",
         ),

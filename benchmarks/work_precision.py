@@ -11,7 +11,7 @@ object comes to rest, and times within `MIN_SEPARATION` of a slip reversal, wher
 Every time is that of one phase, warm, taken in turn. The package is timed as `simulate_motion` alone, called from
 Python and, as a
 share of `MANY` phases that follow one another, within a program; as simulating and scoring (`run`); and with tracing
-and tabulating the wire included. Newton's method, too, is timed called from Python and within a program. All of JAX's
+and tabulating the path included. Newton's method, too, is timed called from Python and within a program. All of JAX's
 programs, of both sides, are called as the package calls its own (`CachedJit`) and compiled as `wholearm_jax.configure`
 says, and again in a second process as XLA does by itself (`PLAIN_TYPES`). For each error level the ratio is between the
 fastest runs that are at least as good.
@@ -244,7 +244,7 @@ def between(problem: Problem, tolerance: float) -> dict[str, float]:
     """The error of the sampled trajectory between the steps of the default solver."""
     options = wa.IntegratorOptions(tolerance=jnp.asarray(tolerance))
     motion = _move(problem.traced.dynamics, problem.phase_schedule, problem.duration, options)
-    # Beyond the wire's end, which a coarse run reaches a little early, the object rests.
+    # Beyond the path's end, which a coarse run reaches a little early, the object rests.
     last = min(problem.stop, float(motion.phase_time[int(motion.count)]))
     shares = jnp.linspace(0.0, last * (1 - 1e-12), 401)
     here = (problem.traced.dynamics, problem.schedule, problem.start, problem.duration, motion)

@@ -21,7 +21,7 @@ DURATION = 1.0
 
 
 def passing(dynamics, knots=9):
-    """Torques that carry the object along a wire and past its end: the best squeeze for a steady acceleration."""
+    """Torques that carry the object along a path and past its end: the best squeeze for a steady acceleration."""
     u = 1.1 * jnp.linspace(0.0, 1.0, knots)  # aimed to arrive early
     length, rate = dynamics.length, 1.1 / DURATION
     places = dynamics.breakpoints[0] + length * jnp.minimum(u, 1.0) ** 2

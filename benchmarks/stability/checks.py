@@ -12,7 +12,7 @@ import numpy as np
 from tests.reference.mechanics import Model, dot
 
 OK, LOST, STUCK, REVERSED, NOT_REACHED, LEFT, AMBIGUOUS, SINGULAR, NO_CONVERGENCE, MAX_STEPS = range(10)
-MADE, BEYOND, UNTIL = 1, 2, 3  # why a wire ends
+MADE, BEYOND, UNTIL = 1, 2, 3  # why a path ends
 
 
 class Limits(NamedTuple):
@@ -109,15 +109,15 @@ def relative(error, *terms):
     return np.abs(error).max(-1) / np.maximum(largest(*terms), 1e-300)
 
 
-# --- along the wire --------------------------------------------------------------------------------------------------
+# --- along the path --------------------------------------------------------------------------------------------------
 
 
 def wire_residuals(model: Model, at) -> dict[str, np.ndarray]:
-    """Closure, tangents, accelerations and forces of a table, column by column, at places of the wire.
+    """Closure, tangents, accelerations and forces of a table, column by column, at places of the path.
 
     `at` holds `z`, `x = dz/ds` (object units), the `chart`, the table's `acceleration` (scenes, places, 5) and `force`
     (scenes, places, 4, 5), and the signs `slip` and `joint`. Each column of the equations of motion is judged against
-    its largest term along the wire.
+    its largest term along the path.
     """
     here = model.geometry(at["z"])
     span = np.abs(at["z"]).max(-1) + 1.0
@@ -162,7 +162,7 @@ def outside(model: Model, z) -> np.ndarray:
 
 
 def end_is_real(model: Model, z, why, contact, until, tolerance) -> np.ndarray:
-    """Whether something does end the wire: a contact made, a contact at its feature's limit, a value met."""
+    """Whether something does end the path: a contact made, a contact at its feature's limit, a value met."""
     z = z[:, None]
     low, high = model.limits()
     along = model.geometry(z).along[:, 0]
@@ -230,7 +230,7 @@ def energy_residual(model: Model, ends, at, weights) -> np.ndarray:
     kinetic = (model.inertia[:, None] * (ends["x"] * ends["v"][..., None]) ** 2).sum(-1) / 2
     potential = -(model.gravity[:, None] * ends["z"][..., :2]).sum(-1)
     change = np.diff(kinetic + potential, axis=1)[:, 0]
-    # A tolerance on `s` and its rate allows an error of energy on the scale of the wire's forces, however short it is.
+    # A tolerance on `s` and its rate allows an error of energy on the scale of the path's forces, however short it is.
     speed = np.maximum(np.abs(at["v"]), 1e-300)
     pull = np.max([np.where(weights > 0, np.abs(p.sum(-1)) / speed, 0.0).max(1) for p in powers], axis=0)
     size = np.max([spent, np.abs(kinetic).max(1), np.abs(np.diff(potential, axis=1)[:, 0]), 0.01 * pull], axis=0)
@@ -307,7 +307,7 @@ def _orientation(model, z, x):
 
 
 def loses_rank(model: Model, z, x, *, step=0.02, steps=400) -> np.ndarray:
-    """Whether `G_n` loses rank on a wire followed from `z` along `x`: `det [G_n; x]` changes sign or vanishes."""
+    """Whether `G_n` loses rank on a path followed from `z` along `x`: `det [G_n; x]` changes sign or vanishes."""
     found = np.zeros(len(z), bool)
     active = np.arange(len(z))
     z, x = z.copy(), x.copy()

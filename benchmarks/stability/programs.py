@@ -39,7 +39,7 @@ GAUSS = np.polynomial.legendre.leggauss(4)
 
 
 class Followed(NamedTuple):
-    """What became of a scene's phase, and its tables read along the wire, at times, and within steps (SI units)."""
+    """What became of a scene's phase, and its tables read along the path, at times, and within steps (SI units)."""
 
     torque: TorqueSchedule
     status: Float[Array, ""]
@@ -101,7 +101,7 @@ def prepare(scene: Scenes, resolution: Resolution) -> tuple[ContactPath, PathDyn
 
 
 def drive(dynamics: PathDynamics, scene: Scenes) -> TorqueSchedule:
-    """A schedule for one scene, by `torque_kind`: 0, the best squeeze for a steady acceleration that passes the wire in
+    """A schedule for one scene, by `torque_kind`: 0, the best squeeze for a steady acceleration that passes the path in
     1 / `pace` of the duration, disturbed by `noise`; 1, random within the limits; 2, a thousand times that; 3, a
     millionth of it."""
     u = scene.pace * scene.knots

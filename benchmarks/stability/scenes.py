@@ -285,7 +285,7 @@ def _touching(rng, shape, *, symmetric, places=40, rounds=46):
     small = Shape(*(column[rows][steady] for column in shape))
     z = first.z[:, 0][steady]
     formation = _shuffled(rng, formation[steady])
-    # A tip exactly at a vertex gives wires that begin at the limit of a feature: interesting, but not so often.
+    # A tip exactly at a vertex gives paths that begin at the limit of a feature: interesting, but not so often.
     keep = ~_pinned(formation, small.count) | (rng.random(len(z)) < 0.3)
     keep &= _free_roots(small, formation, z)
     return Shape(*(column[keep] for column in small)), formation[keep], z[keep], np.ones(int(keep.sum()), bool)
@@ -416,7 +416,7 @@ def _scaled(rng, family, shape, formation, z, exact):
 
 
 def _moving(rng, shape, formation, z):
-    """A coordinate that the wire moves, mostly; in one scene of twenty any."""
+    """A coordinate that the path moves, mostly; in one scene of twenty any."""
     n = len(z)
     model = Model.in_object_units(shape, formation, np.zeros((n, 3)), np.ones((n, 2)))
     model.tangential = _tangential(formation)

@@ -29,13 +29,13 @@ REASONS = (
     "wedged by friction",
     "end or kink not located",
     "table too coarse",
-    "wire too long",
+    "path too long",
 )
 NONE, APART, MISPLACED, STILL, RANK, WEDGED, ASTRAY, COARSE, LONG = range(len(REASONS))
 
 
 class Level(NamedTuple):
-    """How finely wires are tabulated, steps and tolerance of a phase, and how many scenes share a program's run."""
+    """How finely paths are tabulated, steps and tolerance of a phase, and how many scenes share a program's run."""
 
     segments: int
     panels: int
@@ -231,7 +231,7 @@ def refuse(found, scenes, some, paths, tables, status, which, limits):
 
 
 def wedged(model, paths):
-    """Whether friction wedges the object at a node of its wire, by the other model."""
+    """Whether friction wedges the object at a node of its path, by the other model."""
     nodes = np.asarray(paths.nodes, float)
     lanes, panels, count, _ = nodes.shape
     owner = np.repeat(paths.owner, count, axis=1)[:, :, None]
@@ -272,7 +272,7 @@ def simulate(found, scenes, which, paths, tables, level, stepped, final, limits)
 
 
 def check_wire(found, rows, some, model, units, paths, tables, result, limits):
-    """The whole length of a wire and its table."""
+    """The whole length of a path and its table."""
     along = units.remove(result.along)
     for name, value in checks.wire_residuals(model, along).items():
         found[name][rows] = value.max(1)

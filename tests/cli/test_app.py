@@ -271,7 +271,7 @@ def test_torques_beyond_a_limit_are_noted(wholearm, scene_file, tmp_path):
 def test_an_until_that_is_not_on_the_wire_is_noted(wholearm, zero, scene_file):
     path = scene_file(lambda data: data["phase"][0].update(until={"x": 5.0}))
     _, _, err = wholearm("simulate", path, "--torque", zero)
-    assert err.startswith(f"wholearm: note: {path}: phase[0].until: x = 5 is not on its wire, which leads from ")
+    assert err.startswith(f"wholearm: note: {path}: phase[0].until: x = 5 is not on its path, which leads from ")
     path = scene_file(lambda data: data.update(phase=[data["phase"][0] | {"until": {"x": 0.01}}]))
     assert wholearm("simulate", path, "--torque", zero)[2] == ""
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wholearm_jax.core.small_linalg import inverse_and_determinant, null_vector, solve
+from wholearm_jax.core.small_linalg import inverse_and_determinant, linear_solve, null_vector
 
 
 @pytest.mark.parametrize("n", [1, 4, 5])
@@ -24,7 +24,7 @@ def test_rows_of_very_different_sizes():
     matrix = rng.normal(size=(5, 5)) * 10.0 ** rng.integers(-6, 6, (5, 1))
     right = rng.normal(size=5)
     np.testing.assert_allclose(
-        solve(jnp.asarray(matrix), jnp.asarray(right)), np.linalg.solve(matrix, right), rtol=1e-11
+        linear_solve(jnp.asarray(matrix), jnp.asarray(right)), np.linalg.solve(matrix, right), rtol=1e-11
     )
 
 

@@ -323,7 +323,7 @@ def test_a_perturbed_start_touches(predictions):
 
 
 def test_a_perturbed_start_is_the_nearest_that_touches(predictions):
-    """What is left of a shift, in object radii, lies along the wire; the rest closed gaps."""
+    """What is left of a shift, in object radii, lies along the path; the rest closed gaps."""
     scene, nominal = predictions["heptagon"].scene, start_of(predictions["heptagon"])
     shift = np.array([4e-5, -3e-5, 2e-5])
     mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)

@@ -1,4 +1,4 @@
-"""What a margin is of, and when: many rows, rounded times, dips between samples, wires and plans that have none."""
+"""What a margin is of, and when: many rows, rounded times, dips between samples, paths and plans that have none."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -111,7 +111,7 @@ def test_a_wire_that_ends_where_it_begins_is_none(heptagon):
     assert float(wa.margin(back, torque)) == -np.inf
     assert float(wa.bounds(back, traced=traced)[1].value) == -np.inf
     found = wa.optimise(back, traced=traced)
-    assert found.stopped[1] == "the wire cannot be followed: left_formation"
+    assert found.stopped[1] == "the path cannot be followed: left_formation"
     assert len({step.phase for step in found.history}) == 1
 
 

@@ -136,7 +136,7 @@ def test_units_do_not_matter():
 
 @pytest.fixture(scope="module")
 def slide_hold_flip():
-    """The heptagon's plan with a rest between its phases, and its wires."""
+    """The heptagon's plan with a rest between its phases, and its paths."""
     data = to_dict(layered("heptagon"))
     slide, flip = data["phase"]
     pause = {"name": "pause", "contacts": slide["contacts"], "hold": True, "duration": 0.5}
@@ -206,7 +206,7 @@ def test_executed_on_free_bodies(optimised):
 
 @pytest.mark.parametrize("length", [-6e-15, 0.0, 6e-15])
 def test_an_object_is_held_where_its_wire_ends(optimised, length):
-    """The wire of a hold at the end of the phase before it has no length but rounding, of either sign."""
+    """The path of a hold at the end of the phase before it has no length but rounding, of either sign."""
     pause = optimised.result.phases[1]
     dynamics = pause.traced.dynamics
     breaks = dynamics.breakpoints.at[1:].set(dynamics.breakpoints[0] + length)
@@ -245,7 +245,7 @@ def test_a_hold_that_the_contacts_cannot_bear_is_named(slide_hold_flip, optimise
 
 
 def test_an_object_that_departs_is_not_held(slide_hold_flip, optimised):
-    """Backward along the wire as it was traced says `reversed`, forward `not_reached`, each when it departs."""
+    """Backward along the path as it was traced says `reversed`, forward `not_reached`, each when it departs."""
     scene, traced = slide_hold_flip
     _, departure = statics_at_start(scene, scene.phases[1], traced[1])
     base = np.asarray(optimised.torque.values)[31]

@@ -34,7 +34,7 @@ def largest_least_force(offset, slope, limits, forward=None):
 
 
 def best_at(dynamics, duration, place, rests):
-    """The largest least force at a share of the wire, and the most that each interval of speeds could give."""
+    """The largest least force at a share of the path, and the most that each interval of speeds could give."""
     s = dynamics.breakpoints[0] + place * dynamics.length
     motion, force = (np.asarray(a) for a in coefficients(dynamics, s))
     limits = np.asarray(dynamics.torque_limit)

@@ -26,7 +26,7 @@ def _simulate_one(dynamics, intervals, q):
 
 @pytest.fixture(scope="module")
 def flip():
-    """The heptagon's flip, whose wire has a slip reversal near its end."""
+    """The heptagon's flip, whose path has a slip reversal near its end."""
     dynamics = trace(layered("heptagon"))[1].dynamics
     assert int(dynamics.count) == 2
     return dynamics
@@ -124,4 +124,4 @@ def test_joined_intervals_are_the_phase(knots, late, near):
     p = Variables((found.torque.values / dynamics.torque_limit)[None], jnp.asarray(state)[None], jnp.zeros(1))
     ends = simulate_intervals(dynamics, OPTIONS, knots - 1, interval_inputs(p)[0]).end
     np.testing.assert_allclose(ends[:-1], state[1:-1], atol=1e-8)
-    np.testing.assert_allclose(ends[-1], state[-1], atol=near)  # the simulation lands on the wire's end or on rest
+    np.testing.assert_allclose(ends[-1], state[-1], atol=near)  # the simulation lands on the path's end or on rest

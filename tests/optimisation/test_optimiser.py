@@ -234,7 +234,7 @@ def test_hard_phases(case):
 
 
 def test_a_phase_that_brakes_to_the_last_ends_on_time():
-    """It comes to rest and to the wire's end at once: whichever is met first, the time is that of the phase."""
+    """It comes to rest and to the path's end at once: whichever is met first, the time is that of the phase."""
     data = to_dict(layered("heptagon"))
     contacts = ["palm:v0", "palm:v6", "finger1:v1", "finger2:v3"]
     data["phase"].append({"name": "slide on", "contacts": contacts, "toward": "theta1-", "duration": 1.0})

@@ -18,7 +18,7 @@ MAX_DWELL = 0.25
 
 
 def at_rest(dynamics, segment, s, torque):
-    """Acceleration and contact forces at a place of a wire at rest."""
+    """Acceleration and contact forces at a place of a path at rest."""
     panel, xi = locate_panel(dynamics, segment, s)
     terms = jnp.stack([1.0, 0.0, 0.0, *torque])
     return float(evaluate(dynamics.acceleration, panel, xi) @ terms), np.asarray(
@@ -28,7 +28,7 @@ def at_rest(dynamics, segment, s, torque):
 
 @pytest.fixture(scope="module", params=["heptagon", "hexagon"])
 def change(request):
-    """A bundled plan's change of formation: the wire that ends, the rest there, and the motion that follows."""
+    """A bundled plan's change of formation: the path that ends, the rest there, and the motion that follows."""
     scene = layered(request.param)
     traced = wa.trace(scene)
     first, second = (float(top.value) for top in wa.bounds(scene, traced=traced))

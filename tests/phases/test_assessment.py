@@ -24,7 +24,7 @@ def dynamics():
 
 
 def moved(dynamics, ended, short=0.0, speed=0.0, phase_time=1.0, rests=None):
-    """A motion of two steps that ends `short` of its wire (a share), with `speed` in wire lengths a duration.
+    """A motion of two steps that ends `short` of its path (a share), with `speed` in path lengths a duration.
 
     `rests`: until when it waits at first; then the second step moves. None: both move.
     """
@@ -58,7 +58,7 @@ def judged(dynamics, motion, goal=Arrival.AT_REST, margin_result=None, impact=CA
 @pytest.mark.parametrize("ended", [S.OK, S.LEFT_FORMATION])
 @pytest.mark.parametrize(("near", "slow"), [(True, True), (True, False), (False, True)])
 def test_at_rest_at_the_end_means_near_and_slow(dynamics, ended, near, slow, arrival):
-    """The speed left is at most what braking at 6 lengths a duration squared ends within the share of the wire."""
+    """The speed left is at most what braking at 6 lengths a duration squared ends within the share of the path."""
     short = arrival * (1 - EDGE if near else 1 + EDGE)
     speed = np.sqrt(ARRIVAL_SPEED_FACTOR * arrival) * (1 - EDGE if slow else 1 + EDGE)
     status, share, contact = judged(dynamics, moved(dynamics, ended, short, speed), arrival=arrival)

@@ -131,7 +131,7 @@ def _flying(phase):
 
 @pytest.mark.parametrize("x", [0.0, -0.01, -0.015, -0.018])
 def test_a_motion_cut_in_two_goes_on_as_it_was(x):
-    """The second part is entered fast and its wire is a fraction of a step: no overshoot, no impulse, the same end."""
+    """The second part is entered fast and its path is a fraction of a step: no overshoot, no impulse, the same end."""
     scene = layered("heptagon")
     slide = scene.phases[0]
     torque = wa.TorqueSchedule(jnp.array([0.0, 0.6, 1.2]), jnp.array([[0.55, -0.24], [0.55, -0.24], [0.55, -0.24]]))

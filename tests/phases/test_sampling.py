@@ -23,7 +23,7 @@ def assert_moves_as_it_says(course):
 
 @pytest.fixture(scope="module")
 def early():
-    """A phase that is pushed to its wire's end in half of its time, and caught there."""
+    """A phase that is pushed to its path's end in half of its time, and caught there."""
     found = wa.search_by_steps(layered("hexagon"))
     phase = found.scene.phases[0]
     taken = float(phase.duration)

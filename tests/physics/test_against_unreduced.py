@@ -1,4 +1,4 @@
-"""The wire's motion against an independent simulation of all five coordinates (`unreduced.py`, NumPy and SciPy)."""
+"""The path's motion against an independent simulation of all five coordinates (`unreduced.py`, NumPy and SciPy)."""
 
 import functools
 
@@ -23,7 +23,7 @@ from wholearm_jax.simulation import IntegratorOptions
 @jax.jit
 @functools.partial(jax.vmap, in_axes=(None, 0))
 def configurations(dynamics, s):
-    """`z` (SI) at places of a wire."""
+    """`z` (SI) at places of a path."""
     segment = jnp.minimum((s >= dynamics.breakpoints[1:-1]).sum(), dynamics.count - 1)
     return configuration(dynamics, segment, s)
 
@@ -48,7 +48,7 @@ REVERSALS = {("heptagon", 1): [1], ("other hand", 1): [1]}
 
 
 def compared(name, phase, tolerance, samples):
-    """Errors of `z`, `z_dot`, `c_n` (each against its own size) over times from start to the wire's end.
+    """Errors of `z`, `z_dot`, `c_n` (each against its own size) over times from start to the path's end.
 
     The times are the integrator's own steps and `samples` even ones, also between a reversal and the end.
     """
@@ -245,7 +245,7 @@ def test_which_way_an_object_at_rest_sets_out(name, phase):
 @pytest.mark.parametrize("phase", [0, 1])
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])
 def test_wedged(name, phase):
-    """Friction that turns the sign of the other simulation's determinant on the wire is told, and no other."""
+    """Friction that turns the sign of the other simulation's determinant on the path is told, and no other."""
     data = scene_file.to_dict(layered(name))
     free = wholearm_jax.trace(layered(name))[phase].dynamics
     ends = np.asarray(free.breakpoints)[[0, -1]]

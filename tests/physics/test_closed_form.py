@@ -85,7 +85,7 @@ def by_hand(x, x_dot, torque, joints):
 
 @pytest.fixture(scope="module", params=[SMOOTH, ROUGH], ids=["smooth joints", "rough joints"])
 def slide(request):
-    """The joints' friction, the traced wire, places `s` along it and the table's `z` there."""
+    """The joints' friction, the traced path, places `s` along it and the table's `z` there."""
     traced = wholearm_jax.trace(cornered(request.param))[0]
     dynamics = traced.dynamics
     assert int(dynamics.status) == wholearm_jax.Status.OK
@@ -100,7 +100,7 @@ def slide(request):
 
 
 def test_wire(slide):
-    """The whole wire, from the start's projection to where the scene ends it."""
+    """The whole path, from the start's projection to where the scene ends it."""
     _, _, _, z = slide
     np.testing.assert_allclose(z[:, 1], H / 2, atol=1e-11, rtol=0)
     np.testing.assert_allclose(z[:, 2], 0.0, atol=1e-11)

@@ -18,7 +18,7 @@ NODES = 8  # Gauss-Legendre points a step
 @pytest.mark.parametrize("phase", [0, 1])
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])
 def test_balance(name, phase):
-    """Powers integrated over every step of a passage of the wire against the change of energy."""
+    """Powers integrated over every step of a passage of the path against the change of energy."""
     scene = layered(name)
     solid, hand = rigid_body(scene.object), scene.hand
     several = contact_set(solid, hand, scene.phases[phase].formation)

@@ -1,4 +1,4 @@
-"""Scenes at the edge: wires that turn far or meet another, wedging on the way back, tiny pieces, many stops."""
+"""Scenes at the edge: paths that turn far or meet another, wedging on the way back, tiny pieces, many stops."""
 
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -58,7 +58,7 @@ def mechanics(scene):
 
 
 def turning():
-    """A wire that turns so far that one chart does not reach its end; between the charts' meeting and the next reversal
+    """A path that turns so far that one chart does not reach its end; between the charts' meeting and the next reversal
     lies a short piece."""
     return scene(
         [[-0.32, 0.61], [-0.97, -0.25], [0.55, -0.53], [0.9, 0.15]],
@@ -78,7 +78,7 @@ def test_a_wire_may_turn_far():
     assert int(dynamics.status) == wa.Status.OK
     charts = np.asarray(path.chart)[: int(dynamics.count)]
     met = [k for k in range(1, len(charts)) if np.any(charts[k] != charts[k - 1])]
-    assert met, "the wire stays in one chart: it is no test"
+    assert met, "the path stays in one chart: it is no test"
 
     def read(segment, s):
         panel, xi = locate_panel(dynamics, jnp.asarray(segment), s)

@@ -60,7 +60,7 @@ def assert_same(found, expected):
 
 @pytest.fixture(scope="module", params=NAMES)
 def original(request):
-    """A bundled scene as a dict, torques that carry it along both its wires, and what comes of it."""
+    """A bundled scene as a dict, torques that carry it along both its paths, and what comes of it."""
     data = scene_file.to_dict(layered(request.param))
     # Unlike fingers and frictions, so that a mixed-up side shows, and no number that scales as zero.
     data["hand"]["finger1"] |= {"dry": 0.009, "viscous": 0.021, "inertia": 2.1e-3, "offset": 0.002}
@@ -73,7 +73,7 @@ def original(request):
         times, np.concatenate([np.asarray(schedule.values) for schedule in schedules])
     )
     expected = outcome(data, torque)
-    # Both phases move through their wires and beyond; without that, poses would compare nothing.
+    # Both phases move through their paths and beyond; without that, poses would compare nothing.
     assert all(row["status"] == wholearm_jax.Status.LEFT_FORMATION for row in expected)
     return data, torque, expected
 

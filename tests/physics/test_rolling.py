@@ -65,7 +65,7 @@ def on_the_finger():
 
 
 def carrying(dynamics, knots=33):
-    """The least torques for a steady acceleration along a wire and past its end, whatever the contacts bear."""
+    """The least torques for a steady acceleration along a path and past its end, whatever the contacts bear."""
     u = 1.1 * jnp.linspace(0.0, 1.0, knots)
     length, rate = dynamics.length, 1.1 / DURATION
     places, v, a = (
@@ -90,7 +90,7 @@ SCENES = {
 
 @pytest.fixture(scope="module", params=SCENES)
 def rolling(request):
-    """A scene, its traced wire, and torques that carry the object along it."""
+    """A scene, its traced path, and torques that carry the object along it."""
     data = SCENES[request.param]()
     scene = wholearm_jax.parse(data)
     traced = wholearm_jax.trace(scene)[0]

@@ -1,4 +1,4 @@
-"""In 32 bits wires are traced and margins computed, to the digits that there are; what needs 64 bits says so."""
+"""In 32 bits paths are traced and margins computed, to the digits that there are; what needs 64 bits says so."""
 
 import os
 import subprocess

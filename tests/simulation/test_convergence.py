@@ -25,7 +25,7 @@ KNOTS, TORQUE = np.linspace(0.0, 1.0, 5), np.array([[0.9, -0.2], [0.1, 0.5], [0.
 
 @cache
 def dynamics():
-    """A wire of length 1 with two smooth pieces; where they meet, at 0.6, the acceleration jumps as friction makes it.
+    """A path of length 1 with two smooth pieces; where they meet, at 0.6, the acceleration jumps as friction makes it.
 
     Each piece is one polynomial, so that nothing but steps, knots and the meeting can spoil the order.
     """
@@ -52,7 +52,7 @@ def program(solver):
 
 
 def history(solver, parts):
-    """`(s, w)` at every 32nd of the phase, then when the wire's end is reached and at what speed; `parts` equal steps
+    """`(s, w)` at every 32nd of the phase, then when the path's end is reached and at what speed; `parts` equal steps
     in each interval of the torque."""
     times = np.linspace(0.0, 1.0, 4 * parts + 1)
     values = np.stack([np.interp(times, KNOTS, column) for column in TORQUE.T], axis=1)

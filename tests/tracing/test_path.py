@@ -202,7 +202,7 @@ def test_combined_functions_have_the_derivatives_of_a_sum_of_products():
 
 
 def at_places(dynamics, shares):
-    """All of a table's functions at shares of its wire."""
+    """All of a table's functions at shares of its path."""
 
     def one(s):
         segment = jnp.minimum((s >= dynamics.breakpoints[1:-1]).sum(), dynamics.count - 1)
@@ -257,7 +257,7 @@ def test_panels_go_where_the_wire_is_long(lengths, panels):
 
 
 def test_tables_are_refined_until_they_are_good_enough_or_refused():
-    """A wire on which friction nearly wedges the object has functions that 512 panels do not serve."""
+    """A path on which friction nearly wedges the object has functions that 512 panels do not serve."""
     scene, few = layered("heptagon"), Resolution(panels=8)
     panels = {}
     for tolerance in (1e-4, 1e-9):

@@ -1,4 +1,4 @@
-"""Newton's method along a wire, against a general method on the same equations, and its differences."""
+"""Newton's method along a path, against a general method on the same equations, and its differences."""
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from wholearm_jax.tracing.path_root import path_derivatives, solve_on_path
 
 @pytest.fixture(scope="module")
 def flip():
-    """The heptagon's second phase: its system, a place on its wire, the tangent there, and where the third contact's
+    """The heptagon's second phase: its system, a place on its path, the tangent there, and where the third contact's
     slip turns round."""
     scene = layered("heptagon")
     phase, path = scene.phases[1], wa.trace(scene)[1].path
@@ -68,7 +68,7 @@ def test_a_place_is_the_one_that_a_general_method_finds(flip):
 
 
 def test_the_digits_double_with_every_second_step(flip):
-    """From off the wire, where neither the constraints hold nor the slip vanishes."""
+    """From off the path, where neither the constraints hold nor the slip vanishes."""
     mechanics, near, u, contact = flip
     far = near + 0.02 * jnp.asarray([1.0, -1.0, 1.0, 1.0, -1.0])
     exact = solve_on_path(turns, mechanics, near, u, contact).z
@@ -82,7 +82,7 @@ def test_the_digits_double_with_every_second_step(flip):
 
 
 def test_of_two_places_close_together_the_nearer_is_found(flip):
-    """From beside the wire, where what vanishes there says little of how far along it is."""
+    """From beside the path, where what vanishes there says little of how far along it is."""
     mechanics, near, u, contact = flip
     place = solve_on_path(turns, mechanics, near, u, contact).z
 

@@ -44,7 +44,7 @@ def check(
     arrival: Annotated[
         float,
         typer.Option(
-            min=1e-9, max=1.0, help="Arrived: this near the wire's end, as a share of its length; 1e-6 for --optimise."
+            min=1e-9, max=1.0, help="Arrived: this near the path's end, as a share of its length; 1e-6 for --optimise."
         ),
     ] = ARRIVAL_FRACTION,
     tolerance: Annotated[

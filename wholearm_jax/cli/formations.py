@@ -20,7 +20,7 @@ from wholearm_jax.cli.tables import Column, print_json, print_table
 
 NEAR_TOL = 0.25  # gap at a start that is given roughly, in object radii, below which a contact may be meant
 LEGEND = """ends at, turn: the object's position and angle at the end, and by how much it turns
-length: of the wire, in object radii; '-' and a status where none can be followed
+length: of the path, in object radii; '-' and a status where none can be followed
 static, bound: the best least contact force [N] with the object at rest there, and in a phase of 1 s
 enter at speed: what an object that arrives at speed keeps of it; 'pulls': a contact would have to pull"""
 TEXT_COLUMNS = ("contacts", "toward", "leads to")
@@ -36,7 +36,7 @@ def formations(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the formations that hold at a configuration, sliding and rolling, and where their wires lead.
+    """List the formations that hold at a configuration, sliding and rolling, and where their paths lead.
 
     The configuration is the end of a phase, or the start; in a scene without phases, what can begin near its start.
     """

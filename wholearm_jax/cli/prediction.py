@@ -74,7 +74,7 @@ def _note_unreached(name: str, scene, traced) -> None:
         if row >= 0 and int(trace.dynamics.status) == 0 and int(trace.path.end_reason) != PathEnd.TARGET:
             begin, end = (float(z[row]) for z in (trace.begin, trace.end))
             until = f"{COORDINATES[row]} = {float(phase.target.until_value):.6g}"
-            note(f"{name}: phase[{k}].until: {until} is not on its wire, which leads from {begin:.6g} to {end:.6g}")
+            note(f"{name}: phase[{k}].until: {until} is not on its path, which leads from {begin:.6g} to {end:.6g}")
 
 
 def simulate_or_exit(scene, schedule, torque: Path, tolerance: float, traced):

@@ -19,7 +19,7 @@ from wholearm_jax.core.executable_cache import discard_unreadable_entry, keep_co
 from wholearm_jax.core.linear_programme import LinearProgramme, LinearProgrammeSolution
 from wholearm_jax.core.program_cache import CachedJit, enable_program_cache
 from wholearm_jax.core.root_finding import find_bracketed_root
-from wholearm_jax.core.small_linalg import fused_matmul, inverse_and_determinant, null_vector, solve
+from wholearm_jax.core.small_linalg import fused_matmul, inverse_and_determinant, linear_solve, null_vector
 from wholearm_jax.core.staging import computed_at_once, on_host
 from wholearm_jax.core.status import Status
 from wholearm_jax.core.validation import require_positive, require_x64

@@ -89,6 +89,6 @@ def fused_matmul(matrix: Float[Array, "m n"], right: Float[Array, "n *columns"])
     return sum((matrix[:, k, None] * right[k] for k in range(1, len(right))), matrix[:, :1] * right[0])
 
 
-def solve(matrix: Float[Array, "n n"], right: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
+def linear_solve(matrix: Float[Array, "n n"], right: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
     """Return `A^-1 b`."""
     return fused_matmul(inverse_and_determinant(matrix)[0], right)

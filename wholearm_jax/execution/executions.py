@@ -1,7 +1,7 @@
 r"""Execute: a torque schedule driven open loop through `build_mujoco_model`, and what became of it against the
 prediction.
 
-The object is placed at the projected start of the plan's first wire, at rest, every gap 0; nothing settles before the
+The object is placed at the projected start of the plan's first path, at rest, every gap 0; nothing settles before the
 torque begins. Each step holds the torque of its middle. The plan succeeded if at its end the object stands where the
 prediction says and every contact of the last phase is closed, both to within a tolerance. When a contact is made or
 opened is read off the gaps, by one rule for prediction and execution: it touches while its gap is below `TOUCH` and it
@@ -148,7 +148,7 @@ def execute(
 ) -> Execution:
     """Drive the free bodies by a predicted plan's torque schedule, from its start to its end.
 
-    The prediction may fail, but its wires must be known: raises ValueError where one could not be traced, and for a
+    The prediction may fail, but its paths must be known: raises ValueError where one could not be traced, and for a
     `timestep` that is not positive.
     """
     require_positive(timestep=timestep)
@@ -208,7 +208,7 @@ def motor_torques(
 
 
 def start_of(prediction: Result) -> Float[np.ndarray, "5"]:
-    """The projected start of the plan's first wire."""
+    """The projected start of the plan's first path."""
     traced = prediction.phases[0].traced
     radius = np.hypot(*np.asarray(rigid_body(prediction.scene.object).vertices).T).max()
     return np.asarray(traced.path.start) * np.array([radius, radius, 1.0, 1.0, 1.0])
@@ -314,9 +314,9 @@ def touching_contacts_at(scene: Scene, names: tuple[str, ...], z, slack: float |
 
 @jax.jit
 def _touching(solid: RigidBody, hand: Hand, pairs: ContactFormation, z, slack):
-    several = contact_set(solid, hand, pairs)
-    at = jax.vmap(contact_kinematics, (None, 0))(several, z)
-    on_feature = (at.along > several.lower - slack) & (at.along < several.upper + slack)
+    candidates = contact_set(solid, hand, pairs)
+    at = jax.vmap(contact_kinematics, (None, 0))(candidates, z)
+    on_feature = (at.along > candidates.lower - slack) & (at.along < candidates.upper + slack)
     return (jnp.abs(at.gap) < slack) & on_feature  # far behind an edge's line the gap is negative, and nothing touches
 
 

@@ -132,7 +132,7 @@ def _four_constraints(contacts: list[str]) -> list[str]:
     count = len(rows) + rolling
     if count != CONSTRAINTS:
         split = f" ({rolling} rolling, two each; {len(rows) - rolling} sliding, one each)" if rolling else ""
-        raise ValueError(f"{count} constraints{split}; a wire needs exactly {CONSTRAINTS}")
+        raise ValueError(f"{count} constraints{split}; a path needs exactly {CONSTRAINTS}")
     return contacts
 
 

@@ -76,7 +76,7 @@ class ContactFormation(eqx.Module):
     `EDGE`) and feature number.
 
     A sliding contact has one row, its gap. A rolling contact has two, one behind the other: its gap, then its slip,
-    marked `tangential`. Four rows make a wire: `2R + S = 4`.
+    marked `tangential`. Four rows make a path: `2R + S = 4`.
     """
 
     link: Int[Array, "rows"]
@@ -106,7 +106,7 @@ class ContactFormation(eqx.Module):
 
 
 class PathTarget(eqx.Module):
-    """Which way along the wire, and where to stop before its end.
+    """Which way along the path, and where to stop before its end.
 
     Travel starts with the sign `sign` in coordinate number `path_coordinate` (-1: in the one that changes most); the
     phase

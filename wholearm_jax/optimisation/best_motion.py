@@ -127,7 +127,7 @@ def _each_phase(scene: Scene, traced, solve) -> tuple[BestMotion | None, ...]:
 def _best_motion(path: TracedPhase, phase: Phase, optimum: PathOptimum) -> BestMotion:
     """Bring an optimum to the host, with the contacts' names."""
     begin, length = float(path.dynamics.breakpoints[0]), float(path.dynamics.length)
-    place, point_place, hardest = ((np.asarray(s) - begin) / length for s in _places(optimum))
+    place, point_place, critical = ((np.asarray(s) - begin) / length for s in _places(optimum))
     feasible = bool(optimum.converged)
     formation = phase.formation
     owners = [*formation.contact_of_row, *np.array(formation.contact_of_row)[np.asarray(formation.tangential)]]
@@ -138,7 +138,7 @@ def _best_motion(path: TracedPhase, phase: Phase, optimum: PathOptimum) -> BestM
         time_gain=float(optimum.time_gain),
         contact_weights=dict(zip(formation.names, (weights / weights.sum()).tolist(), strict=True)),
         limit_gains=tuple(np.asarray(optimum.limit_gain).tolist()),
-        hardest_place=float(hardest),
+        hardest_place=float(critical),
         place=place,
         time=np.asarray(optimum.time),
         speed=np.asarray(optimum.speed),

@@ -128,7 +128,7 @@ def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> GroupSolution:
     options = group.options
     for path in group.traced:
         if int(path.dynamics.status) != Status.OK:
-            reason = f"the wire cannot be followed: {Status(int(path.dynamics.status)).label}"
+            reason = f"the path cannot be followed: {Status(int(path.dynamics.status)).label}"
             return [uniform_schedule(t, np.zeros((options.knots, 2))) for t in group.moving_times], reason, []
     phase_dynamics = [path.dynamics for path in group.traced]
     guesses = initial_guesses(phase_dynamics, group.moving_times, options.knots, GUESS_TORQUE_FRACTION)
@@ -155,7 +155,7 @@ def _infeasible_reason(group: CoupledPhases) -> str | None:
     weakest = int(np.argmin(group.bounds))
     if group.bounds[weakest] <= 0:
         percent = 100 * float(group.margin_bounds[weakest].path_fraction)
-        return f"no torque within limits holds this formation at {percent:.0f} % of its wire"
+        return f"no torque within limits holds this formation at {percent:.0f} % of its path"
     if group.begin is not None and not group.begin.is_feasible:
         return "no torque lets this formation take over at the limited rate"
     return None

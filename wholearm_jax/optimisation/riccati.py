@@ -124,8 +124,8 @@ def _backward_pass(at: StageLayout, stages: LQStages, quadratic: ParametricLQ):
         K = jnp.stack([c * first - b * second, a * second - b * first]) / (a * c - b * b)
         return hessian[:size, :size] - first[:, None] * K[0] - second[:, None] * K[1], (K, V_zz[:LEVEL])
 
-    in_turn = _in_turn(stages.hessian), _in_turn(stages.dynamics)
-    V_zz, (K, V_rows) = jax.lax.scan(eliminate, terminal, in_turn, reverse=True)
+    by_stage = _in_turn(stages.hessian), _in_turn(stages.dynamics)
+    V_zz, (K, V_rows) = jax.lax.scan(eliminate, terminal, by_stage, reverse=True)
     return V_zz, K, V_rows
 
 

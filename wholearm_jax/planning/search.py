@@ -90,7 +90,7 @@ class _Search:
     radius: float
     max_phases: int
     queue: list[Any] = field(default_factory=list)
-    seen: set[tuple[int, ...]] = field(default_factory=set)
+    visited: set[tuple[int, ...]] = field(default_factory=set)
     order: Any = field(default_factory=itertools.count)
     nearest: tuple[float, tuple[Step, ...]] = (np.inf, ())
     nodes: int = 0
@@ -179,9 +179,9 @@ def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tup
     """Add a configuration to the queue unless it is there already."""
     unit = np.array([search.radius, search.radius, 1, 1, 1])
     key = tuple(np.round(z / unit / MERGE_TOL).astype(int).tolist())
-    if key in search.seen:
+    if key in search.visited:
         return
-    search.seen.add(key)
+    search.visited.add(key)
     distance = _phases_to_go(search, z)
     if distance < search.nearest[0] - 1e-9:
         search.nearest = (distance, steps)
@@ -223,8 +223,8 @@ def _stops(search: _Search, move: Move):
     yield Step(move.contacts, move.toward, None, move.places[last], float(lowest[last])), True
     for name, value in search.goal.values.items():
         yield from _crossings(move, lowest, name, value)
-    moved = np.abs(move.places[last] - move.places[0]) / np.array([search.radius, search.radius, 1, 1, 1])
-    name = COORDINATES[int(np.argmax(moved))]
+    displacement = np.abs(move.places[last] - move.places[0]) / np.array([search.radius, search.radius, 1, 1, 1])
+    name = COORDINATES[int(np.argmax(displacement))]
     for fraction in STOPS:
         value = float(move.places[round(fraction * last)][COORDINATES.index(name)])
         yield from itertools.islice(_crossings(move, lowest, name, value), 1)
@@ -237,9 +237,9 @@ def _crossings(move: Move, lowest: np.ndarray, name: str, value: float):
     crossed = np.flatnonzero((off[:-1] != 0) & (off[:-1] * off[1:] <= 0))
     if len(crossed) and crossed[0] + 1 < len(off):
         k = int(crossed[0])
-        share = off[k] / (off[k] - off[k + 1])
-        z = move.places[k] + share * (move.places[k + 1] - move.places[k])
-        if 0 < k + share < len(off) - 1 - 1e-6:
+        fraction = off[k] / (off[k] - off[k + 1])
+        z = move.places[k] + fraction * (move.places[k + 1] - move.places[k])
+        if 0 < k + fraction < len(off) - 1 - 1e-6:
             yield Step(move.contacts, move.toward, (name, value), z, float(lowest[k + 1])), False
 
 
@@ -282,8 +282,10 @@ def _explain(search: _Search, nearest: Plan | None, *, out_of_time: bool) -> str
         if d > search.goal.tolerance[name]
     ]
     limit = "the search's limit was reached" if out_of_time else "all moves were tried"
-    ways = _obstructions(search, z)
-    return f"no plan: {limit}; nearest: {', '.join(parts) or 'at the goal'}" + (f"; there {ways}" if ways else "")
+    obstructions = _obstructions(search, z)
+    return f"no plan: {limit}; nearest: {', '.join(parts) or 'at the goal'}" + (
+        f"; there {obstructions}" if obstructions else ""
+    )
 
 
 def _obstructions(search: _Search, z: np.ndarray) -> str:

@@ -1,6 +1,6 @@
-"""Which formation next? All formations of four constraints that hold at a configuration, with where their wires lead.
+"""Which formation next? All formations of four constraints that hold at a configuration, with where their paths lead.
 
-What touches at a configuration (within `CONTACT_TOL`) is combined by fours. Each combination has a wire through the
+What touches at a configuration (within `CONTACT_TOL`) is combined by fours. Each combination has a path through the
 configuration, and two ways along it; a way that would push another touching contact together ends at once and is left
 out. What remains is what a plan can do next.
 """
@@ -34,14 +34,14 @@ from wholearm_jax.planning.path_choices import path_choices
 from wholearm_jax.tracing import Resolution
 
 CONTACT_TOL = 1e-7  # gap, in the object's radius, below which a contact touches
-MIN_PATH_LENGTH = 1e-3  # wire length, in the object's radius, below which a way leads nowhere
+MIN_PATH_LENGTH = 1e-3  # path length, in the object's radius, below which a way leads nowhere
 
 
 @dataclass(frozen=True)
 class Successor:
-    """A formation and a way along its wire.
+    """A formation and a way along its path.
 
-    `toward` is the way as scene files write it; `length` the wire's, in the object's radii; `ends` says why it ends, at
+    `toward` is the way as scene files write it; `length` the path's, in the object's radii; `ends` says why it ends, at
     `end` (SI). `static` [N] is the best least force at rest at the start (`-inf`: torques cannot hold it there),
     `bound` [N] the certificate for a second's motion from rest to rest. `speed` is `ds/dt` after an impact at
     the `z_dot` given to `successor_formations` (0 without one), `pulls` whether an impulse of it would pull.
@@ -69,7 +69,7 @@ class Successor:
 
 @jax.jit
 def exit_velocity(dynamics: PathDynamics) -> Float[Array, "5"]:
-    """`z_dot` (SI) at a wire's end for `ds/dt = 1`."""
+    """`z_dot` (SI) at a path's end for `ds/dt = 1`."""
     panel, xi = locate_panel(dynamics, dynamics.count - 1, dynamics.breakpoints[-1])
     return evaluate(dynamics.velocity, panel, xi)
 
@@ -142,8 +142,11 @@ def successor_formations(
 def _successor(scene, z, z_dot, names, chosen, toward: str) -> Successor | None:
     """Trace one way; None where it leads nowhere."""
     onward = path_target(toward)
-    told, plain = (rigid_body(scene.object), scene.hand, scene.gravity, chosen, z, onward), as_device_array(True)
-    traced = trace_phase(*told, Resolution(), plain, plain)  # as `trace` does: one program
+    problem, begins_plan = (
+        (rigid_body(scene.object), scene.hand, scene.gravity, chosen, z, onward),
+        as_device_array(True),
+    )
+    traced = trace_phase(*problem, Resolution(), begins_plan, begins_plan)  # as `trace` does: one program
     dynamics = traced.dynamics
     status, length = Status(int(dynamics.status)), float(dynamics.length)
     if status is Status.OK and length < MIN_PATH_LENGTH:

@@ -25,7 +25,7 @@ SETTING_NAMES = {
     "passing": "least speed at changes, over the mean",
     "hold_margin": "margin of the holds [N]",
     "varied": "varied scenes",
-    "arrival": "arrived within, of the wire's length",
+    "arrival": "arrived within, of the path's length",
     "unseen_share": "share that holds of unseen scenes",
     "unseen_margin": "worst margin [N] of unseen scenes",
     "unseen_share_nominal": "share that holds of unseen scenes, nominal schedule",

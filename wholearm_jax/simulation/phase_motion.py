@@ -103,7 +103,7 @@ def _simulate_stage(ode: PathODE, options: IntegratorOptions, ignore_stops, stat
     """Wait at rest if need be, then move until the segment ends, the object comes to rest, or time is over."""
     dynamics, phase_schedule, _ = ode
     # Wait at rest.
-    state, rest_status, room = _dwell(dynamics, phase_schedule, options, ignore_stops, state)
+    state, rest_status, capacity = _dwell(dynamics, phase_schedule, options, ignore_stops, state)
     blocked = rest_status != int(Status.OK)
     # Integrate until the first step past an event.
     is_last = state.segment >= dynamics.count - 1
@@ -114,7 +114,7 @@ def _simulate_stage(ode: PathODE, options: IntegratorOptions, ignore_stops, stat
     overshot = steps.passed
     last_step = jnp.maximum(steps.count - 1, 0)
     last_time, row = jnp.where(overshot, take_row(steps.end, last_step), 1.0), take_row(steps.row, last_step)
-    state, complete = _record_steps(state, steps, overshot, room)
+    state, complete = _record_steps(state, steps, overshot, capacity)
     # Take that step again up to the event.
     node = state.phase_time, state.s, state.w
     event = step_to_event(ode, options, state.segment, row, node, last_time, s_stop, w_stop, overshot)
@@ -151,21 +151,23 @@ def _dwell(dynamics: PathDynamics, phase_schedule: PhaseSchedule, options, ignor
     phase_time = jnp.where(is_resting, phase_time, state.phase_time)
     rest_status = jnp.where(is_resting, rest_status, int(Status.OK))
     waits = is_resting & (phase_time > state.phase_time)
-    room = options.max_steps - state.record.count - waits
+    capacity = options.max_steps - state.record.count - waits
     row = interval(phase_schedule, stop_gradient(state.phase_time + phase_time) / 2)
     node = phase_time, state.s, state.w
     record = append_step(state.record, waits, node, state.w, state.segment, row, at_rest=True)
-    return state._replace(phase_time=phase_time, record=record), rest_status, room
+    return state._replace(phase_time=phase_time, record=record), rest_status, capacity
 
 
-def _record_steps(state: _MotionState, steps: AcceptedSteps, overshot, room) -> tuple[_MotionState, Bool[Array, ""]]:
+def _record_steps(
+    state: _MotionState, steps: AcceptedSteps, overshot, capacity
+) -> tuple[_MotionState, Bool[Array, ""]]:
     """Record all steps but a last one that overshot.
 
     Returns the state after them, and whether they are complete: the steps of several stages may need more room than
     there is.
     """
-    complete = steps.complete & (steps.count <= room)
-    count = jnp.clip(jnp.where(overshot, steps.count - 1, steps.count), 0, jnp.maximum(room, 0))
+    complete = steps.complete & (steps.count <= capacity)
+    count = jnp.clip(jnp.where(overshot, steps.count - 1, steps.count), 0, jnp.maximum(capacity, 0))
     record = append_steps(state.record, steps, jnp.stack([state.s, state.w]), state.segment, count)
     phase_time, s, w = take_row(record.nodes, state.record.count + count)
     w = jnp.where(count > 0, w, state.w)  # a node at a segment's end holds the speed in the chart before

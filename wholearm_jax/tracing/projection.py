@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from wholearm_jax.core import eps_power, fused_matmul, solve, take_row
+from wholearm_jax.core import eps_power, fused_matmul, linear_solve, take_row
 from wholearm_jax.model import PathTarget, ScaledMechanics, constraint_jacobian, constraints, contact_kinematics
 from wholearm_jax.tracing.curve import oriented_tangent
 from wholearm_jax.tracing.path_root import solve_on_path
@@ -33,7 +33,7 @@ def project_onto_path(mechanics: ScaledMechanics, initial_guess: Float[Array, "5
 
     def least_norm_step(z):
         rows = constraint_jacobian(fixed.contacts, z)
-        move = -fused_matmul(rows.T, solve(fused_matmul(rows, rows.T), constraints(fixed.contacts, z)))
+        move = -fused_matmul(rows.T, linear_solve(fused_matmul(rows, rows.T), constraints(fixed.contacts, z)))
         move = jnp.where(jnp.isfinite(move), move, 0.0)
         return z + move * jnp.minimum(1.0, MAX_PROJECTION_STEP / jnp.maximum(jnp.abs(move).max(), 1e-30))
 
