@@ -15,6 +15,7 @@ from wholearm_jax.cli.arguments import (
     read_coordinate,
     refuse_unwritable,
 )
+from wholearm_jax.cli.progress import solver_progress
 from wholearm_jax.cli.tables import Column, print_json, print_table
 
 GOAL_HELP = 'Where the object is to be, such as "x=-0.03,phi=-40 deg" [m, rad]; instead of the scene\'s [goal].'
@@ -31,8 +32,10 @@ def plan(
     count: Annotated[int, typer.Option(min=1, help="Number of plans at most.")] = 3,
     phases: Annotated[int, typer.Option(min=1, help="Longest plan.")] = 5,
     time: Annotated[float, typer.Option(min=0.0, help="Seconds after which the search ends with what it has.")] = 60.0,
+    rolling: Annotated[bool, typer.Option(help="Whether contacts may roll.")] = True,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for plan.toml, further plans and pictures of their poses.")
+        Path | None,
+        typer.Option(help="Folder for plan.toml, further plans, pictures of their poses and the search."),
     ] = None,
     optimise: Annotated[bool, typer.Option("--optimise", help="Go on to torques for the best plan.")] = False,
     as_json: AsJson = False,
@@ -43,8 +46,15 @@ def plan(
 
     loaded, folder = load_start(scene), make_output_folder(out)
     wanted = _goal(scene, load_goal(scene), goal, by, tolerance)
+    limits = {"margin": margin, "count": count, "max_phases": phases, "rolling": rolling, "time_limit": time}
     try:
-        found = find_plans(loaded, **wanted, margin=margin, count=count, max_phases=phases, time_limit=time)
+        with solver_progress() as progress:
+            bar = progress.add_task("plan", total=None, state="compiling")
+
+            def show(nodes: int, distance: float) -> None:
+                progress.update(bar, state=f"{nodes} poses, the nearest about {distance:.1f} moves from the goal")
+
+            found = find_plans(loaded, **wanted, **limits, callback=show)
     except ValueError as error:
         raise BadInput(f"{scene}: {error}") from None
     shown = found.plans or (() if found.nearest is None else (found.nearest,))
@@ -122,15 +132,19 @@ def _rows(one) -> list[tuple[str, ...]]:
 
 
 def _write(folder: Path, found, shown) -> None:
-    """Write each plan as a scene, and a strip of its poses."""
-    from wholearm_jax.files import save
-    from wholearm_jax.plotting import plot_plan_poses, save_figure
+    """Write each plan as a scene, a strip of its poses, and a picture of the search."""
+    from wholearm_jax.files import FileSet, replace_files, save
+    from wholearm_jax.plotting import plot_plan_poses, plot_search, save_figure
 
-    with refuse_unwritable(f"--out {folder}"):
-        for number, one in enumerate(shown):
-            name = "nearest" if not found.found else "plan" if number == 0 else f"plan{number + 1}"
-            save(one.scene, folder / f"{name}.toml")
-            save_figure(lambda one=one: plot_plan_poses(one.scene, one.begins, one.ends), folder, name)
+    first = "plan" if found.found else "nearest"
+    names = [first, *(f"{first}{number}" for number in range(2, len(shown) + 1))]
+    former = [path.stem for path in folder.glob("plan*.toml")] if found.found else []
+    files = FileSet(None, tuple(f"{name}.toml" for name in {*names, *former}), (*{*names, *former}, "search"))
+    with refuse_unwritable(f"--out {folder}"), replace_files(folder, files) as scratch:
+        for name, one in zip(names, shown, strict=False):
+            save(one.scene, scratch / f"{name}.toml")
+            save_figure(lambda one=one: plot_plan_poses(one.scene, one.begins, one.ends), scratch, name)
+        save_figure(lambda: plot_search(found), scratch, "search")
 
 
 def _optimise(best, folder: Path | None) -> None:

@@ -46,7 +46,7 @@ def is_traced(*trees) -> bool:
     return any([isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees)])
 
 
-def take_row(values: Array, index: Int[Array, ""]) -> Array:
+def take_row(values: Array, index: int | Int[Array, ""]) -> Array:
     """Return `values[index]` for an index known to be in range.
 
     It skips the handling of negative indices, three operations an access.

@@ -1,5 +1,6 @@
-"""Which contact formation can come next."""
+"""Which contact formation can come next, and which lead to a goal."""
 
+from wholearm_jax.planning.plans import Plan, PlanningResult
 from wholearm_jax.planning.search import plan
 from wholearm_jax.planning.successors import (
     Successor,
@@ -10,6 +11,8 @@ from wholearm_jax.planning.successors import (
 )
 
 __all__ = [
+    "Plan",
+    "PlanningResult",
     "Successor",
     "exit_velocity",
     "flush_sides",

@@ -1,7 +1,9 @@
 """Moves of the planner: paths of all formations that hold at a configuration, many of them in one program."""
 
 import functools
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -52,20 +54,26 @@ class _Paths(NamedTuple):
     end_contact: Int[Array, "moves"]
 
 
-def moves_from(scene: Scene, z: Float[Array, "5"], touching: Sequence[str] | None = None) -> tuple[Move, ...]:
+def moves_from(
+    scene: Scene, z: Float[Array, "5"], touching: Sequence[str] | None = None, *, rolling: bool = True
+) -> tuple[Move, ...]:
     """Return all moves from a configuration: formations `2R + S = 4` of what touches, sliding and rolling, both ways.
 
     Args:
         scene: the hand and the object.
         z: the configuration (5,), SI.
         touching: the contacts to combine; those that touch at `z` unless given.
+        rolling: whether contacts may roll.
     """
     names = touching_contacts(scene, z) if touching is None else touching
-    chosen = [*path_choices(scene, z, names, rolling=True)]
+    chosen = [*path_choices(scene, z, names, rolling=rolling)]
+    parts = [chosen[first : first + MOVES_PER_CALL] for first in range(0, len(chosen), MOVES_PER_CALL)]
+    if not parts:
+        return ()
+    first, others = _trace(scene, z, parts[0]), parts[1:]  # compiles, once
+    traced = [first, *_threads().map(functools.partial(_trace, scene, z), others)]
     moves = []
-    for first in range(0, len(chosen), MOVES_PER_CALL):
-        part = chosen[first : first + MOVES_PER_CALL]
-        paths = jax.device_get(_trace(scene, z, [*part, *part[:1] * (MOVES_PER_CALL - len(part))]))
+    for part, paths in zip(parts, traced, strict=True):
         for k, (contacts, toward) in enumerate(part):
             row = jax.tree.map(lambda a, k=k: a[k], paths)
             if row.status == Status.OK and row.length >= MIN_PATH_LENGTH:
@@ -74,18 +82,27 @@ def moves_from(scene: Scene, z: Float[Array, "5"], touching: Sequence[str] | Non
     return tuple(moves)
 
 
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    """The threads in which calls of the program run: one a processor."""
+    return ThreadPoolExecutor(os.cpu_count())
+
+
 @functools.lru_cache(maxsize=4096)
 def _formation(contacts: tuple[str, ...]) -> ContactFormation:
     return contact_formation(contacts)
 
 
 def _trace(scene: Scene, z, chosen) -> _Paths:
+    """Trace the paths of at most `MOVES_PER_CALL` choices; the first is repeated to fill up the call."""
+    chosen = [*chosen, *chosen[:1] * (MOVES_PER_CALL - len(chosen))]
     formations = jax.tree.map(lambda *rows: np.stack(rows), *(_formation(contacts) for contacts, _ in chosen))
     targets = [path_target(toward) for _, toward in chosen]
     stacked = jax.tree.map(lambda *rows: np.stack(rows), *targets)
     as_arrays = functools.partial(jax.tree.map, jnp.asarray)
     body = rigid_body(scene.object)
-    return _trace_moves(body, scene.hand, scene.gravity, as_arrays(formations), as_arrays(stacked), jnp.asarray(z))
+    paths = _trace_moves(body, scene.hand, scene.gravity, as_arrays(formations), as_arrays(stacked), jnp.asarray(z))
+    return jax.device_get(paths)
 
 
 @CachedJit

@@ -16,6 +16,7 @@ _MODULES = {
     "plot_plan_poses": "pose_figures",
     "plot_pose": "pose_figures",
     "plot_result": "plan_figures",
+    "plot_search": "planning_figures",
     "plot_strip": "pose_figures",
     "plot_successors": "pose_figures",
     "plot_torques": "plan_figures",

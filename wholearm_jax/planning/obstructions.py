@@ -1,0 +1,42 @@
+"""What stands in the way of a goal, in words."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from wholearm_jax.model import ANGLE_COORDINATES
+from wholearm_jax.planning.goal import Goal
+from wholearm_jax.planning.moves import Move
+from wholearm_jax.tracing import PathEnd
+
+MOST = 3  # moves that are named
+
+
+def explain_failure(goal: Goal, z: np.ndarray, moves: Sequence[Move], floor: float, *, out_of_time: bool) -> str:
+    """Say how near a search came to a goal, and what stops the moves that would lead nearer.
+
+    Args:
+        goal: the goal.
+        z: the nearest configuration that was reached (5,), SI.
+        moves: the moves from there that lead nearer to the goal.
+        floor: the least margin [N] that a plan must allow.
+        out_of_time: whether the search ended before all moves were tried.
+    """
+    missing = [
+        f"{name} is off by " + (f"{np.degrees(d):.3g} deg" if name in ANGLE_COORDINATES else f"{1e3 * d:.3g} mm")
+        for name, d in zip(goal.values, goal.distance(z), strict=True)
+        if d > goal.tolerance[name]
+    ]
+    limit = "the search's limit was reached" if out_of_time else "all moves were tried"
+    lines = [_explain_move(move, floor) for move in moves[:MOST]] or ["nothing that touches leads nearer"]
+    return f"no plan: {limit}; nearest: {', '.join(missing) or 'at the goal'}; there {'; '.join(lines)}"
+
+
+def _explain_move(move: Move, floor: float) -> str:
+    name = f"{' '.join(move.contacts)} toward {move.toward}"
+    lowest = float(move.margins.min())
+    if lowest > floor:
+        return f"{name} ends too soon" + (" at an obstacle" if move.end_reason == PathEnd.OBSTACLE else "")
+    where = int(np.argmin(move.margins)) / (len(move.margins) - 1)
+    held = f"has a margin of {lowest:.3g} N" if np.isfinite(lowest) else "cannot be held by torques within limits"
+    return f"{name} {held} at {100 * where:.0f} % of its path"

@@ -1,0 +1,98 @@
+"""Plans: phases that lead to a goal, each with its certificate, and what a search for them returns."""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from wholearm_jax.core import CachedJit, Status, as_device_array
+from wholearm_jax.margin import margin_upper_bound
+from wholearm_jax.model import Phase, Scene, contact_formation, path_target
+from wholearm_jax.phases import describe_end, trace
+from wholearm_jax.planning.goal import Goal
+
+_phase_bound = CachedJit(margin_upper_bound)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One phase of a plan: a move, and the place at which it is left."""
+
+    contacts: tuple[str, ...]
+    toward: str
+    until: tuple[str, float] | None  # a coordinate and its value; None: the path's end
+    end: np.ndarray  # (5,) `z` (SI)
+    margin: float  # [N], least on the way, at rest
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Phases that lead to the goal, as a scene that `optimise` takes as it is."""
+
+    scene: Scene
+    steps: tuple[Step, ...]
+    begins: tuple[np.ndarray, ...]  # `z` (SI) where each phase begins, and
+    ends: tuple[np.ndarray, ...]  # ends
+    reasons: tuple[str, ...]  # why each path ends
+    bounds: tuple[float, ...]  # upper bound of each phase's margin [N]
+
+    @property
+    def bound(self) -> float:
+        """The plan's certificate: no torque gives a larger margin."""
+        return min(self.bounds)
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A move of the search, from one configuration to another."""
+
+    begin: np.ndarray  # (5,) `z` (SI)
+    end: np.ndarray
+    margin: float  # [N], least on the way, at rest
+
+
+@dataclass(frozen=True)
+class PlanningResult:
+    """The best plans, or what stands in the way."""
+
+    start: np.ndarray  # (5,) `z` (SI)
+    goal: Goal
+    plans: tuple[Plan, ...]  # best first
+    nearest: Plan | None  # where there is none: to the configuration nearest to the goal
+    reason: str  # why there is no plan, empty if there is one
+    nodes: int  # configurations that were expanded
+    moves: int  # paths that were traced
+    graph: tuple[Edge, ...]  # what the search reached, and from where
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a plan."""
+        return bool(self.plans)
+
+
+def make_plan(
+    scene: Scene, start: Float[np.ndarray, "5"], steps: tuple[Step, ...], duration: float, goal: Goal | None
+) -> Plan | None:
+    """Trace steps as a plan at full resolution; None where a phase cannot be traced, or the goal is missed."""
+    phases = tuple(
+        Phase(
+            f"{k + 1}: {' '.join(step.contacts)}",
+            contact_formation(step.contacts),
+            path_target(step.toward, dict([step.until]) if step.until else None),
+            as_device_array(duration),
+        )
+        for k, step in enumerate(steps)
+    )
+    planned = eqx.tree_at(lambda s: (s.start, s.phases), scene, (as_device_array(start), phases))
+    traced = trace(planned)
+    if any(int(one.dynamics.status) != Status.OK or bool(one.dynamics.ends_at_obstacle) for one in traced):
+        return None
+    ends = tuple(np.asarray(one.end) for one in traced)
+    if goal is not None and not goal.is_reached(ends[-1]):
+        return None
+    reasons = tuple(describe_end(planned, phase, one) for phase, one in zip(phases, traced, strict=True))
+    values = tuple(
+        float(_phase_bound(one.dynamics, phase.duration).value) for phase, one in zip(phases, traced, strict=True)
+    )
+    return Plan(planned, steps, tuple(np.asarray(one.begin) for one in traced), ends, reasons, values)
