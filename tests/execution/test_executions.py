@@ -32,7 +32,7 @@ from wholearm_jax.execution.executions import (
     target_of,
 )
 from wholearm_jax.execution.mujoco_model import CONVEX, ContactCompliance, _wedges, build_mujoco_model
-from wholearm_jax.execution.trials import Amounts, _draw_scenes, _summary, run_trials, start_near
+from wholearm_jax.execution.trials import Amounts, _draw_scenes, _summary, lay_in_hand, run_trials, start_near
 from wholearm_jax.files.execution_results import _perturbed_row, write_execution
 from wholearm_jax.model.kinematics import contact_kinematics, contact_set, normal_jacobian
 from wholearm_jax.model.mechanics import scaled_mechanics
@@ -306,7 +306,7 @@ def test_a_copy_without_friction_can_be_told():
     """Of a coefficient of 0 any share is 0."""
     scene = eqx.tree_at(lambda s: s.object.friction, layered("heptagon"), jnp.array([0.0, 0.1, 0.2]))
     (changed,) = _draw_scenes(scene, Amounts(friction=0.1), 0, 1)
-    told = _summary(scene, changed, np.zeros(5), np.zeros(5), ExecutionOutcome.OK)
+    told = _summary(scene, changed, (np.zeros(5), None), (np.zeros(5), 0.0, {}), Tolerance())
     assert told.friction[0] == 1.0
     np.testing.assert_allclose(told.friction[1:], np.asarray(changed.object.friction[1:]) / [0.1, 0.2])
     json.dumps(_perturbed_row(told), allow_nan=False)
@@ -320,6 +320,36 @@ def test_a_perturbed_start_touches(predictions):
     assert np.abs(contact_kinematics(several, z).gap).max() < 1e-15
     moved = z - start_of(predictions["heptagon"])
     assert 1e-5 < np.abs(moved[:2]).max() < 1e-3
+
+
+def test_a_plan_that_begins_with_a_rolling_contact_can_be_perturbed():
+    """Its two rows of one contact are one gap; the object is laid where its own path begins, and judged there, too."""
+    scene = layered("tipping")
+    prediction = wa.simulate(scene, wa.read_torque(DATA / "tipping_torque.csv"))
+    shift = np.array([4e-4, -3e-4, 2e-4])
+    z = start_near(scene, start_of(prediction), shift)
+    kinematics = contact_kinematics(contact_set(rigid_body(scene.object), scene.hand, scene.phases[0].formation), z)
+    assert np.abs(kinematics.gap).max() < 1e-15
+    assert np.abs(z - start_of(prediction))[0] > 1e-5, "it may stand beside its place"
+    many = run_trials(prediction, 4, Amounts(0.02, 0.02, 1e-5, 1e-4), timestep=1e-3, tolerance=Tolerance(1e-3, 0.05))
+    assert all(np.isfinite(run.end).all() for run in many.runs)
+    assert many.successes == 4
+    assert many.own_successes == 4
+    assert many.message.endswith("at the ends of their own paths: 4")
+    assert all(0 < np.abs(run.own_target - target_of(prediction))[:2].max() < 1e-3 for run in many.runs)
+
+
+def test_a_perturbed_object_is_judged_by_its_own_end(predictions):
+    """An object that is laid far along its path ends where its own path ends, as an independent trace has it."""
+    prediction = predictions["heptagon"]
+    scene = eqx.tree_at(lambda s: s.object.vertices, prediction.scene, prediction.scene.object.vertices * 1.001)
+    own = lay_in_hand(prediction, scene, start_near(scene, start_of(prediction), np.zeros(3)))
+    end = wa.trace(eqx.tree_at(lambda s: s.start, scene, jnp.asarray(own.start)))[-1].end
+    np.testing.assert_allclose(own.target, end, atol=1e-9)
+    near, far = Tolerance(1e-6, 1e-6), np.abs(own.target - target_of(prediction))[:2].max()
+    assert far > 1e-5
+    run = _summary(prediction.scene, scene, (target_of(prediction), own.target), (own.target, 0.0, {}), near)
+    assert (run.ending is ExecutionOutcome.OK, run.own_ending is ExecutionOutcome.OK) == (False, True)
 
 
 def test_a_perturbed_start_is_the_nearest_that_touches(predictions):

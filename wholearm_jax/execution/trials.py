@@ -4,8 +4,10 @@ Every draw is uniform within plus or minus its amount, as in an ensemble (`ensem
 link's friction coefficient, one on the mass (and with it the inertia), an offset of each coordinate of each vertex, and
 a displacement of the object's start in x, y and, over its radius, phi. The object that is then laid in the hand touches
 as the first formation says: the start is the nearest configuration at which the perturbed object's gaps are 0
-(least-norm Newton steps in object units). The
-torques stay those of the unperturbed plan, and so does the end that counts as success.
+(least-norm Newton steps in object units); a contact that should roll may begin at any place of its link. Where a vertex
+would lie in a link there, the object is laid where its own path begins (`tracing.settle_on_link`). The
+torques stay those of the unperturbed plan. Success is counted twice: against the end of the unperturbed plan, and
+against the end of the perturbed object's own path from where it was laid.
 """
 
 # MuJoCo's names come from a compiled module, which type checkers cannot see into.
@@ -16,13 +18,14 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from joblib import Parallel, delayed
 
-from wholearm_jax.core import require_positive, unstack_trees
+from wholearm_jax.core import Status, require_positive, unstack_trees
 from wholearm_jax.ensembles import make_ensemble, wilson_interval
 from wholearm_jax.execution.executions import (
     ExecutionOutcome,
@@ -38,6 +41,7 @@ from wholearm_jax.execution.executions import (
 )
 from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
 from wholearm_jax.model import (
+    Arrival,
     ContactFormation,
     Scene,
     gaps,
@@ -46,7 +50,7 @@ from wholearm_jax.model import (
     rigid_body,
     scaled_mechanics,
 )
-from wholearm_jax.phases import Result
+from wholearm_jax.phases import Result, target_configuration, trace
 
 
 class Amounts(NamedTuple):
@@ -60,7 +64,11 @@ class Amounts(NamedTuple):
 
 @dataclass(frozen=True)
 class PerturbedRun:
-    """One execution: factors and shifts drawn, where the object ended, and what that counts as."""
+    """One execution: factors and shifts drawn, where the object ended, and what that counts as.
+
+    `ending` is judged by the end of the unperturbed plan, `own_ending` by `own_target`, the end of the perturbed
+    object's own path, None where that has none.
+    """
 
     friction: Float[np.ndarray, "3"]
     mass: float
@@ -68,6 +76,8 @@ class PerturbedRun:
     position_error: float
     angle_error: float
     ending: ExecutionOutcome
+    own_target: Float[np.ndarray, "5"] | None
+    own_ending: ExecutionOutcome
 
 
 @dataclass(frozen=True)
@@ -88,12 +98,18 @@ class TrialsResult:
         return wilson_interval(self.successes, len(self.runs))
 
     @property
+    def own_successes(self) -> int:
+        """How many end where the perturbed object's own path does."""
+        return sum(run.own_ending is ExecutionOutcome.OK for run in self.runs)
+
+    @property
     def message(self) -> str:
         """The success rate in one line."""
         low, high = self.interval
         share = 100 * self.successes / len(self.runs)
         span = f"95 % confidence interval {100 * low:.1f} to {100 * high:.1f} %"
-        return f"{self.successes} of {len(self.runs)} perturbed executions succeed: {share:.1f} %, {span}"
+        own = f"at the ends of their own paths: {self.own_successes}"
+        return f"{self.successes} of {len(self.runs)} perturbed executions succeed: {share:.1f} %, {span}; {own}"
 
 
 def run_trials(
@@ -121,17 +137,17 @@ def run_trials(
     begins, step = clock(prediction.scene, timestep)
     torques = motor_torques(prediction.torque, begins, step)
     nominal, target = start_of(prediction), target_of(prediction)
-
-    def copies():
-        for scene, shift in zip(scenes, displacements, strict=True):
-            yield build_mujoco_model(scene, step, softness), start_near(scene, nominal, shift)
-
-    found = rollout_in_parallel(copies(), torques, min(workers or os.cpu_count() or 1, count))
+    laid = [
+        lay_in_hand(prediction, scene, start_near(scene, nominal, shift))
+        for scene, shift in zip(scenes, displacements, strict=True)
+    ]
+    copies = ((build_mujoco_model(scene, step, softness), path.start) for scene, path in zip(scenes, laid, strict=True))
+    found = rollout_in_parallel(copies, torques, min(workers or os.cpu_count() or 1, count))
     runs = []
     expected = meets_obstacle(prediction)
-    for scene, (end, creep, met) in zip(scenes, found, strict=True):
-        ending, _ = assess_execution(scene, end, target, tolerance, creep, {} if expected else met)
-        runs.append(_summary(prediction.scene, scene, end, target, ending))
+    for scene, own, (end, creep, met) in zip(scenes, laid, found, strict=True):
+        targets, reached = (target, own.target), (end, creep, {} if expected else met)
+        runs.append(_summary(prediction.scene, scene, targets, reached, tolerance))
         if callback is not None:
             callback(runs[-1])
     return TrialsResult(amounts, seed, tolerance, tuple(runs))
@@ -172,12 +188,35 @@ def start_near(scene: Scene, z, shift) -> Float[np.ndarray, "5"]:
 def _touch_down(shape, hand, gravity, formation: ContactFormation, z, shift) -> Float[Array, "5"]:
     mechanics = scaled_mechanics(rigid_body(shape), hand, gravity, formation)
     displaced = z / mechanics.configuration_unit + jnp.zeros(5).at[:3].set(shift / mechanics.length)
+    is_gap = ~formation.tangential  # the second row of a rolling contact repeats its gap
 
     def closer(_, z):
-        rows = normal_jacobian(mechanics.contacts, z)
-        return z - rows.T @ jnp.linalg.solve(rows @ rows.T, gaps(mechanics.contacts, z))
+        rows = jnp.where(is_gap[:, None], normal_jacobian(mechanics.contacts, z), 0.0)
+        gram = rows @ rows.T + jnp.diag(jnp.where(is_gap, 0.0, 1.0))
+        return z - rows.T @ jnp.linalg.solve(gram, jnp.where(is_gap, gaps(mechanics.contacts, z), 0.0))
 
     return jax.lax.fori_loop(0, 20, closer, displaced) * mechanics.configuration_unit
+
+
+class OwnPath(NamedTuple):
+    """Where a perturbed object is laid, and where its own path ends; None where it has none, or moves at its end."""
+
+    start: Float[np.ndarray, "5"]
+    target: Float[np.ndarray, "5"] | None
+
+
+def lay_in_hand(prediction: Result, scene: Scene, start) -> OwnPath:
+    """Lay a perturbed object where its own path begins near `start`, which is free of overlaps; at `start` if nowhere.
+
+    A plan that need not stand still at its end (`target_of`) has no end but the prediction's.
+    """
+    traced = trace(eqx.tree_at(lambda s: s.start, scene, jnp.asarray(start)))
+    known = [int(phase.dynamics.status) == Status.OK for phase in traced]
+    moving = prediction.phases[-1].arrive in (Arrival.MOVING, Arrival.ANY_SPEED)
+    return OwnPath(
+        start=np.asarray(traced[0].begin) if known[0] else start,
+        target=np.asarray(target_configuration(scene.phases[-1], traced[-1])) if all(known) and not moving else None,
+    )
 
 
 def rollout_in_parallel(
@@ -194,14 +233,24 @@ def _end(bodies: MujocoModel, start, torques) -> tuple[Float[np.ndarray, "5"], f
     return z[-1], creep, met
 
 
-def _summary(scene: Scene, changed: Scene, end, target, ending: ExecutionOutcome) -> PerturbedRun:
-    off = end - target
+def _summary(scene: Scene, changed: Scene, targets, reached, tolerance: Tolerance) -> PerturbedRun:
+    """Judge where a perturbed object ended by `targets`: the unperturbed plan's end and its own path's, or None.
+
+    `reached` is where it ended, how far contacts crept, and what links met.
+    """
+    (end, creep, met), (target, own) = reached, targets
+    ending, own_ending = (
+        assess_execution(changed, end, np.full(5, np.inf) if goal is None else goal, tolerance, creep, met)[0]
+        for goal in targets
+    )
     was, now = (np.asarray(one.object.friction) for one in (scene, changed))
     return PerturbedRun(
         friction=np.where(was > 0, now / np.where(was > 0, was, 1.0), 1.0),
         mass=float(changed.object.mass / scene.object.mass),
         end=end,
-        position_error=float(np.hypot(*off[:2])),
-        angle_error=float(off[2]),
+        position_error=float(np.hypot(*(end - target)[:2])),
+        angle_error=float((end - target)[2]),
         ending=ending,
+        own_target=own,
+        own_ending=own_ending,
     )

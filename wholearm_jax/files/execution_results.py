@@ -43,6 +43,7 @@ def execution_summary(execution: Execution, trials: TrialsResult | None = None, 
             "seed": trials.seed,
             "executions": len(trials.runs),
             "successes": trials.successes,
+            "own_path_successes": trials.own_successes,
             "interval_95": list(trials.interval),
             "runs": [_perturbed_row(run) for run in trials.runs],
         }
@@ -54,7 +55,8 @@ def _perturbed_row(run: PerturbedRun) -> dict[str, Any]:
     """Return the outcome of one perturbed execution."""
     drawn = {"friction": run.friction.tolist(), "mass": run.mass, "status": run.ending.value}
     errors = {"position_error": run.position_error, "angle_error": run.angle_error}
-    return null_for_undefined(drawn | errors | {"end": run.end.tolist()})
+    own = {"own_path_end": None if run.own_target is None else run.own_target.tolist()}
+    return null_for_undefined(drawn | errors | {"end": run.end.tolist(), "own_path_status": run.own_ending.value} | own)
 
 
 def write_execution(execution: Execution, path: str | Path, samples: int = 201) -> None:
