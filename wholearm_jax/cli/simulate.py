@@ -35,7 +35,7 @@ def simulate(
     loaded = load_scene(scene, set_)
     from wholearm_jax.core import wait_for
     from wholearm_jax.files import read_torque
-    from wholearm_jax.optimisation import bounds
+    from wholearm_jax.optimisation import bounds, explain
     from wholearm_jax.phases import precompile_simulate
 
     schedule = read_torque(torque)
@@ -43,11 +43,12 @@ def simulate(
     compiled = precompile_simulate(loaded, schedule, tolerance)
     traced = trace_or_exit(scene, loaded)
     wait_for(compiled)
-    result = simulate_or_exit(loaded, schedule, torque, tolerance, traced)
+    margin_bounds = bounds(loaded, traced=traced)
+    result = explain(simulate_or_exit(loaded, schedule, torque, tolerance, traced), margin_bounds=margin_bounds)
     if not as_json:
         print_phases(result)
     gradient = _check_gradient(loaded, schedule, as_json) if check_gradient else {}
-    values = tuple(float(b.value) for b in bounds(loaded, traced=traced))
+    values = tuple(float(b.value) for b in margin_bounds)
     more = {"command": "simulate", "torque": str(torque), "tolerance": tolerance} | gradient
     write_and_exit(result, folder, samples, as_json, bounds=values, **more)
 

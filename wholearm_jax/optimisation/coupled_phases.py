@@ -138,7 +138,9 @@ def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> GroupSolution:
     best, history = _solve_from_guesses(scene, group, guesses)
     near_bound = best.is_ok and best.bound_fraction >= 1 - options.tolerance
     reason = f"within {options.tolerance:g} of the bound" if near_bound else best.reason
-    return _schedules(group, best.p), reason, history
+    # Where iterations end without torques, the phase is simulated under those of its first guess, which are in limits.
+    found = best.p if np.isfinite(np.asarray(best.p.torque)).all() else guesses[0]
+    return _schedules(group, found), reason, history
 
 
 class _Candidate(NamedTuple):

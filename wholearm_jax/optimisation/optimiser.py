@@ -45,6 +45,7 @@ import optax
 from wholearm_jax.core import Status, on_host, require_positive, require_x64, wait_for
 from wholearm_jax.margin import MarginBound
 from wholearm_jax.model import Arrival, Scene, TorqueSchedule, concatenate_schedules, replace_duration
+from wholearm_jax.optimisation.advice import Search, explain
 from wholearm_jax.optimisation.coupled_phases import (
     MIN_DURATION_FRACTION,
     CoupledPhases,
@@ -55,7 +56,7 @@ from wholearm_jax.optimisation.coupled_phases import (
 )
 from wholearm_jax.optimisation.plan_transitions import holding_schedule, rest_transitions
 from wholearm_jax.optimisation.precompilation import precompile_optimise, schedule_rows
-from wholearm_jax.optimisation.quasistatic_plan import bounds, explain_negative_bounds, require_knots
+from wholearm_jax.optimisation.quasistatic_plan import bounds, require_knots
 from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.optimisation.solver import IterationRecord
 from wholearm_jax.phases import Result, TracedPhase, build_result, simulate_phases, trace
@@ -184,7 +185,8 @@ def _solve_plan(
     phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, durations, strict=True))
     scene, torque = eqx.tree_at(lambda s: s.phases, scene, phases), concatenate_schedules(schedules)
     simulated = simulate_phases(scene, torque, traced, with_step_capacity(IntegratorOptions(), options.knots))
-    result = explain_negative_bounds(build_result(scene, torque, traced, simulated), margin_bounds, traced)
+    search = Search(options.knots, options.rate_limit is not None)
+    result = explain(build_result(scene, torque, traced, simulated), margin_bounds=margin_bounds, search=search)
     return OptimisationResult(scene, torque, result, margin_bounds, tuple(stopped), tuple(history))
 
 

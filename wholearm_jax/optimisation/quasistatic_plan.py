@@ -3,29 +3,20 @@
 Derivation: section 8 of `docs/derivation.md`.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from wholearm_jax.core import CachedJit, Status, as_device_array, computed_at_once, is_traced, require_x64
-from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.margin import (
     MAX_ROLLING,
     MarginBound,
-    affine_coefficients,
-    best_quasistatic_torque,
     margin_upper_bound,
 )
 from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, concatenate_schedules, uniform_schedule
 from wholearm_jax.optimisation.initial_guess import initial_guesses, transformed_rest_to_rest_torques
 from wholearm_jax.optimisation.plan_transitions import holding_schedule
-from wholearm_jax.phases import PhaseResult, Result, TracedPhase, configuration, statics_at_start, trace
-
-REMEDY_BOUND = "lower the friction or raise the torque limits, turn the object another way, or choose other contacts"
+from wholearm_jax.phases import TracedPhase, statics_at_start, trace
 
 
 def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[TracedPhase, ...] = ()) -> TorqueSchedule:
@@ -159,38 +150,3 @@ def rolling_count(phase: Phase) -> int:
 
 
 upper_bound = CachedJit(margin_upper_bound)
-
-
-def explain_negative_bounds(
-    result: Result, margin_bounds: Sequence[MarginBound], traced: tuple[TracedPhase, ...]
-) -> Result:
-    """Say of each phase that fails because no torque could hold it where its bound is negative, and what would pull."""
-    phases = tuple(
-        replace(phase, detail=_negative_bound(phase, bound, path), remedy=REMEDY_BOUND)
-        if phase.status is not Status.OK and phase.arrive is not Arrival.HOLD and -np.inf < float(bound.value) < 0
-        else phase
-        for phase, bound, path in zip(result.phases, margin_bounds, traced, strict=True)
-    )
-    return replace(result, phases=phases)
-
-
-def _negative_bound(phase: PhaseResult, bound: MarginBound, traced: TracedPhase) -> str:
-    """Name the place at which a phase's bound is negative, and the contacts whose forces are the least there."""
-    z, forces = (np.asarray(a) for a in _forces_at_best_torque(traced.dynamics, bound.s))
-    rows = np.flatnonzero(~np.asarray(traced.dynamics.tangential))
-    pulling = [name for name, row in zip(phase.contacts, rows, strict=True) if forces[row] < 0]
-    whose = f": {' and '.join(pulling)} would have to pull" if pulling else ""
-    place = "at its start" if float(bound.path_fraction) == 0 else f"{100 * float(bound.path_fraction):.0f} % along it"
-    pose = f"x = {1e3 * z[0]:.1f} mm, phi = {np.degrees(z[2]):.1f} deg"
-    return (
-        f"no torque moves the object along this path: the bound is {float(bound.value):.3g} N {place} ({pose}){whose}"
-    )
-
-
-@jax.jit
-def _forces_at_best_torque(dynamics: PathDynamics, s):
-    """Return `z` (SI) at `s`, and the constraint forces [N] of the best torque at rest there."""
-    torque = best_quasistatic_torque(dynamics, s).torque
-    _, force = affine_coefficients(dynamics, s)
-    segment = jnp.minimum((s >= dynamics.breakpoints[1:-1]).sum(), dynamics.count - 1)
-    return configuration(dynamics, segment, s), force @ jnp.concatenate([jnp.array([1.0, 0.0, 0.0]), torque])

@@ -10,7 +10,7 @@ import numpy as np
 
 from wholearm_jax.core import Status
 from wholearm_jax.margin import RestInterval, contact_statics, rest_margin
-from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule
+from wholearm_jax.model import COORDINATES, Arrival, Phase, Scene, TorqueSchedule
 from wholearm_jax.phases.obstacles import describe_refused_start
 from wholearm_jax.phases.phase_ends import configuration, describe_end
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
@@ -19,6 +19,7 @@ from wholearm_jax.phases.phase_tracing import TracedPhase
 SLIP_TOL = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
 REFUSED_STARTS = (Status.LEFT_FORMATION, Status.OBSTACLE)  # statuses of a path that mean that it cannot begin
 REMEDY_START = "the path cannot begin there: correct the start's pose and angles, or choose other contacts or fingers"
+UNTIL_FRACTION = 0.05  # of a path that ends at an obstacle, which the advice leaves out
 MIN_REST = 1e-9  # share of a phase: an object that comes to rest at its end does so earlier or later by rounding
 
 
@@ -60,12 +61,13 @@ class PhaseResult:
         if self.status is Status.OK:
             return f"{self.name}: ok, margin {self.margin:.4g} N at {self.margin_contact}, t = {self.margin_time:.4g} s"
         whose = f" at {self.contact}" if self.contact else ""
-        advice = SLIP_TOL if self.slips else self.status.advice
+        advice = self.remedy or (SLIP_TOL if self.slips else self.status.advice)
         if self.detail:
-            advice = f"{self.detail}; {self.remedy or advice}"
+            advice = f"{self.detail}; {advice}"
         rests = self.status is Status.STUCK and self.holds
         since = f", at rest since {self.holds[-1].start:.6g} s" if rests else ""
-        return f"{self.name}: {self.status.label}{whose}, t = {self.time:.6g} s{since}: {advice}"
+        when = f", t = {self.time:.6g} s" if np.isfinite(self.time) else ""
+        return f"{self.name}: {self.status.label}{whose}{when}{since}: {advice}"
 
 
 @dataclass(frozen=True)
@@ -132,10 +134,27 @@ def build_result(scene: Scene, torque: TorqueSchedule, traced, found) -> Result:
             traced=at,
             outcome=outcome,
             detail=_detail(scene, phase, at, Status(int(assessment.status))),
-            remedy=REMEDY_START if int(at.path.status) in REFUSED_STARTS else None,
+            remedy=path_remedy(phase, at),
         )
         rows.append(_with_holds(one))
     return Result(scene, torque, tuple(rows))
+
+
+def path_remedy(phase: Phase, traced: TracedPhase) -> str | None:
+    """Return what helps where a phase has no path, or one that ends at an obstacle; None where it is all right."""
+    status, path = Status(int(traced.dynamics.status)), Status(int(traced.path.status))
+    if path in REFUSED_STARTS:
+        return REMEDY_START
+    if status is Status.MAX_STEPS:
+        return "the path goes on beyond the largest number of continuation steps; end the phase with `until`"
+    if status is Status.OK and bool(traced.dynamics.ends_at_obstacle):
+        begin, end = np.asarray(traced.begin), np.asarray(traced.end)
+        units = np.array([np.hypot(*(end - begin)[:2]) + 1e-12] * 2 + [1.0] * 3)
+        row = int(np.argmax(np.abs(end - begin) / units))
+        value = end[row] - UNTIL_FRACTION * (end - begin)[row]
+        before = f"end the phase before with `until = {{{COORDINATES[row]} = {value:.4g}}}`"
+        return f"{before}, or change the hand"
+    return None
 
 
 def _detail(scene: Scene, phase: Phase, traced: TracedPhase, status: Status) -> str | None:

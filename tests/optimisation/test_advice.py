@@ -1,0 +1,97 @@
+"""Advice by cause: each failing phase names its own cause, and following the advice helps."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.files import to_dict
+from wholearm_jax.model import replace_duration
+from wholearm_jax.optimisation import Search, advice, explain
+
+CASES = Path(__file__).parents[1] / "data" / "cases"
+KNOTS = 11
+
+
+def with_duration(scene, number, duration):
+    phases = tuple(replace_duration(p, duration) if k == number else p for k, p in enumerate(scene.phases))
+    return eqx.tree_at(lambda s: s.phases, scene, phases)
+
+
+@pytest.fixture(scope="module")
+def heptagon():
+    return wa.load("heptagon")
+
+
+@pytest.fixture(scope="module")
+def too_fast(heptagon):
+    return wa.optimise(with_duration(heptagon, 0, 0.02), knots=KNOTS)
+
+
+def test_too_little_time_is_named_with_a_duration_that_works(heptagon, too_fast):
+    first, second = too_fast.result.phases
+    assert "faster than the torques allow" in first.message
+    assert "optimise" not in first.message
+    assert "nan" not in first.message
+    longer = float(re.search(r"--set 0\.duration=([\d.]+)", first.message)[1])
+    assert 0.05 < longer < 0.2
+    assert wa.optimise(with_duration(heptagon, 0, longer), knots=KNOTS).result.status is wa.Status.OK
+    assert np.isfinite(np.asarray(too_fast.torque.values)).all()
+    assert np.all(np.abs(too_fast.torque.values) <= np.asarray(heptagon.hand.torque_limit) * (1 + 1e-12))
+    alone = wa.optimise(heptagon, knots=KNOTS).result.phases[1]
+    assert second.status is wa.Status.OK, "a phase after one that fails is judged as if that had not"
+    assert second.margin == pytest.approx(alone.margin, rel=1e-3)
+
+
+def test_too_few_knots_are_named_with_a_number_that_works(heptagon):
+    failed = next(p for p in wa.optimise(heptagon, knots=3).result.phases if p.status is not wa.Status.OK)
+    assert "3 knots did not lead to it" in failed.message
+    assert "duration" not in failed.remedy
+    assert int(re.search(r"--knots (\d+)", failed.message)[1]) == KNOTS  # with which `too_fast` follows it: ok
+    assert wa.optimise(heptagon, knots=KNOTS).result.status is wa.Status.OK
+
+
+def test_another_schedule_is_advised_to_be_optimised(heptagon):
+    still = wa.simulate(heptagon, wa.torque_schedule([0.0, 2.0], [[0.0, 0.0], [0.0, 0.0]]))
+    for phase in explain(still).phases:
+        assert phase.remedy.endswith("`wholearm optimise` looks for torques that do")
+
+
+def test_where_the_bound_is_negative_no_more_time_is_advised():
+    scene = wa.load(CASES / "box_rolling_start.toml")
+    scene = eqx.tree_at(lambda s: s.hand.layered, scene, jnp.asarray(True))
+    still = wa.simulate(scene, wa.torque_schedule([0.0, 10.0], [[0.1, -0.1], [0.1, -0.1]]))
+    (phase,) = (p for p in explain(still).phases if p.status is not wa.Status.OK)
+    assert "would have to pull" in phase.detail
+    assert "duration" not in phase.message
+    assert "optimise" not in phase.remedy
+
+
+def test_before_an_obstacle_a_phase_may_end():
+    scene = wa.load(CASES / "finger_below_palm.toml")
+    result = wa.simulate(scene, wa.torque_schedule([0.0, 10.0], [[0.1, -0.1], [0.1, -0.1]]))
+    coordinate, value = re.search(r"until = \{(\w+) = ([-\d.e]+)\}", result.phases[1].remedy).groups()
+    data = to_dict(scene)
+    data["phase"][1]["until"] = {coordinate: float(value)}
+    assert bool(wa.trace(scene)[1].dynamics.ends_at_obstacle)
+    before = wa.trace(wa.parse(data))[1]
+    assert int(before.dynamics.status) == wa.Status.OK
+    assert not bool(before.dynamics.ends_at_obstacle)
+
+
+def test_each_cause_has_its_own_words(too_fast):
+    """Torque limits, rates, and a phase that is hardly longer than the fastest motion."""
+    phase = replace(too_fast.result.phases[0], duration=1.0)
+    search = Search(KNOTS)
+    detail, remedy = advice._explain_motion(0, phase, np.inf, search)
+    assert "however long" in detail
+    assert "torque limits" in remedy
+    assert "--set 2.duration=1.4" in advice._explain_motion(2, phase, 0.9, search)[1]
+    assert "--rate-limit" in advice._explain_motion(0, phase, 0.1, Search(KNOTS, limits_rates=True))[1]
+    for value, rounded in ((0.0931, 0.094), (0.93, 0.93), (1.01, 1.1), (123.0, 130.0)):
+        assert advice.round_up_digits(value) == pytest.approx(rounded, rel=1e-12)

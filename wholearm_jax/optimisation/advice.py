@@ -1,0 +1,137 @@
+"""Advice on a plan that fails: the cause of each phase's failure, and what helps against that cause.
+
+Causes are looked for in this order: a negative bound (no torque holds the contacts somewhere on the path, however
+slowly), torque limits (no motion keeps them, however long it takes), too little time, and last torques that do not
+reach what a motion along the path can.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from wholearm_jax.core import Status
+from wholearm_jax.dynamics import PathDynamics
+from wholearm_jax.margin import MarginBound, affine_coefficients, best_quasistatic_torque
+from wholearm_jax.model import Arrival
+from wholearm_jax.optimisation.best_motion import shortest_motions
+from wholearm_jax.optimisation.quasistatic_plan import bounds
+from wholearm_jax.phases import PhaseResult, Result, TracedPhase, configuration
+
+REMEDY_BOUND = "lower the friction or raise the torque limits, turn the object another way, or choose other contacts"
+REMEDY_LIMITS = "raise the torque limits, lower the friction, or choose other contacts"
+REMEDY_OPTIMISE = "`wholearm optimise` looks for torques that do"
+SPARE_TIME = 1.5  # a phase should have this much more time than its fastest motion takes
+MIN_KNOTS = 11  # fewer are too few for most phases
+
+
+@dataclass(frozen=True)
+class Search:
+    """How the torques of a plan were searched: knots a phase, and whether their rates were limited."""
+
+    knots: int
+    limits_rates: bool = False
+
+
+def explain(result: Result, *, margin_bounds: Sequence[MarginBound] = (), search: Search | None = None) -> Result:
+    """Say of each phase that fails what the cause is, and advise what helps against it.
+
+    Args:
+        result: a simulated plan.
+        margin_bounds: the result of `bounds`, to reuse it.
+        search: how the optimiser searched its torques; None for torques from elsewhere.
+
+    Returns:
+        The same result with `detail` and `remedy` of phases that fail on the way; others are as they were.
+    """
+    traced = tuple(phase.traced for phase in result.phases)
+    failed = [k for k, phase in enumerate(result.phases) if _fails_on_its_way(phase)]
+    if not failed:
+        return result
+    values = margin_bounds or bounds(result.scene, traced=traced)
+    open_ones = [k for k in failed if float(values[k].value) > 0 and result.phases[k].arrive is not Arrival.HOLD]
+    fastest = shortest_motions(result.scene, 0.0, traced=traced) if open_ones else (None,) * len(traced)
+    phases = list(result.phases)
+    for k in failed:
+        motion = fastest[k]
+        if float(values[k].value) <= 0:
+            phases[k] = _explain_negative_bound(phases[k], values[k], traced[k])
+        elif motion is not None:
+            detail, remedy = _explain_motion(k, phases[k], motion.duration, search)
+            phases[k] = replace(phases[k], detail=detail or phases[k].detail, remedy=remedy)
+    return replace(result, phases=tuple(phases))
+
+
+def _fails_on_its_way(phase: PhaseResult) -> bool:
+    """Whether a phase has a path, and torques fail it there."""
+    has_path = int(phase.traced.dynamics.status) == Status.OK
+    return has_path and phase.status not in (Status.OK, Status.OBSTACLE)
+
+
+def _explain_motion(number: int, phase: PhaseResult, fastest: float, search: Search | None) -> tuple[str | None, str]:
+    """Return cause and remedy of a phase that torques could hold at rest anywhere; `fastest` [s] is its fastest motion.
+
+    The fastest motion presses every contact and stays within the torque limits; it is infinite where there is none.
+    """
+    longer = (
+        f"--set {number}.duration={round_up_digits(SPARE_TIME * fastest) if math.isfinite(fastest) else math.inf:g}"
+    )
+    if math.isinf(fastest):
+        return "within the torque limits no motion presses every contact, however long it takes", REMEDY_LIMITS
+    if fastest > phase.duration:
+        detail = f"faster than the torques allow: the phase takes {fastest:.3g} s or longer, not {phase.duration:.3g} s"
+        return detail, f"give it more time ({longer})"
+    if search is None:
+        return phase.detail, f"{_first_half(phase)}; {REMEDY_OPTIMISE}"
+    possible = f"a motion of {fastest:.3g} s or longer exists"
+    if SPARE_TIME * fastest > phase.duration:
+        return f"{possible}, which leaves little spare time in {phase.duration:.3g} s", f"give it more time ({longer})"
+    if search.limits_rates:
+        return f"{possible} where torques may jump", f"allow faster torques (--rate-limit) or more time ({longer})"
+    return f"{possible}, but {search.knots} knots did not lead to it", (
+        f"take more knots (--knots {max(MIN_KNOTS, 2 * search.knots)})"
+    )
+
+
+def _first_half(phase: PhaseResult) -> str:
+    """Return what a status means: its advice as far as the remedy."""
+    return phase.status.advice.partition(";")[0]
+
+
+def round_up_digits(value: float, digits: int = 2) -> float:
+    """Round a positive number up to so many significant digits."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - digits + 1)
+    return math.ceil(value / unit - 1e-9) * unit
+
+
+def _explain_negative_bound(phase: PhaseResult, bound: MarginBound, traced: TracedPhase) -> PhaseResult:
+    """Say where a phase's bound is negative, and what would pull."""
+    if phase.arrive is Arrival.HOLD or not np.isfinite(float(bound.value)):
+        detail = f"no torque holds the object there: the bound is {float(bound.value):.3g} N"
+        return replace(phase, detail=detail, remedy=REMEDY_BOUND)
+    return replace(phase, detail=_negative_bound(phase, bound, traced), remedy=REMEDY_BOUND)
+
+
+def _negative_bound(phase: PhaseResult, bound: MarginBound, traced: TracedPhase) -> str:
+    """Name the place at which a phase's bound is negative, and the contacts whose forces are the least there."""
+    z, forces = (np.asarray(a) for a in _forces_at_best_torque(traced.dynamics, bound.s))
+    rows = np.flatnonzero(~np.asarray(traced.dynamics.tangential))
+    pulling = [name for name, row in zip(phase.contacts, rows, strict=True) if forces[row] < 0]
+    whose = f": {' and '.join(pulling)} would have to pull" if pulling else ""
+    place = "at its start" if float(bound.path_fraction) == 0 else f"{100 * float(bound.path_fraction):.0f} % along it"
+    pose = f"x = {1e3 * z[0]:.1f} mm, phi = {np.degrees(z[2]):.1f} deg"
+    return (
+        f"no torque moves the object along this path: the bound is {float(bound.value):.3g} N {place} ({pose}){whose}"
+    )
+
+
+@jax.jit
+def _forces_at_best_torque(dynamics: PathDynamics, s):
+    """Return `z` (SI) at `s`, and the constraint forces [N] of the best torque at rest there."""
+    torque = best_quasistatic_torque(dynamics, s).torque
+    _, force = affine_coefficients(dynamics, s)
+    segment = jnp.minimum((s >= dynamics.breakpoints[1:-1]).sum(), dynamics.count - 1)
+    return configuration(dynamics, segment, s), force @ jnp.concatenate([jnp.array([1.0, 0.0, 0.0]), torque])
