@@ -23,6 +23,7 @@ RUNS = {  # what each runs, after `import NAME as module`
     "skipping": "module.problems = lambda **_: PROBLEMS(referred=False)[:1]; run('--quick')",
     "work_precision": "print(module.in_turn(PROBLEMS(referred=False)[0], 'Dopri8', 1e-7, 1))",
 }
+SLOW = ("batch", "cold_start", "gradients", "optimisation", "prediction", "skipping", "work_precision")
 NEEDS = {"collocation": "casadi", "optimisation": "casadi", "skipping": "numba", "work_precision": "numba"}
 PRELUDE = """
 import sys, jax, wholearm_jax
@@ -53,12 +54,13 @@ def test_every_script_is_run():
     assert folders == {"stability"}
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in RUNS])
 def test_benchmark_runs_on_its_smallest_part(name, tmp_path):
     pytest.importorskip(NEEDS.get(name, "numpy"))
     assert run_apart(PRELUDE.format(name=name) + RUNS[name], tmp_path)
 
 
+@pytest.mark.slow
 def test_the_stability_sweep_runs_on_a_few_scenes(tmp_path):
     assert "block 0:" in run_apart(SWEEP, tmp_path)
     assert (tmp_path / "records.npz").exists()

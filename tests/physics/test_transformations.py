@@ -113,6 +113,16 @@ GRADIENTS = {
     "jacfwd": lambda f: jax.jacfwd(lambda x: f(x, FORWARD)),
 }
 FUNCTIONS = [margin_of_torque, margin_of_friction, bound_of_mass, quasistatic_of_mass, length_of_friction]
+QUICK = {"value_and_grad", "grad of scan"}  # of the gradients of whole margins, which take long to record
+
+
+def gradient_cases():
+    """Every function with every transformation; what takes longest and differs least from others is slow."""
+    for function in FUNCTIONS:
+        for name, transform in GRADIENTS.items():
+            is_slow = function in (margin_of_torque, margin_of_friction) and name not in QUICK
+            marks = pytest.mark.slow if is_slow else ()
+            yield pytest.param(function, transform, id=f"{function.__name__}-{name}", marks=marks)
 
 
 @pytest.mark.parametrize("transform", VALUES.values(), ids=VALUES.keys())
@@ -122,8 +132,7 @@ def test_values_can_be_recorded(function, transform, scene, torque):
     assert jax.eval_shape(transform(value), argument).shape == ()
 
 
-@pytest.mark.parametrize("transform", GRADIENTS.values(), ids=GRADIENTS.keys())
-@pytest.mark.parametrize("function", FUNCTIONS)
+@pytest.mark.parametrize(("function", "transform"), [*gradient_cases()])
 def test_gradients_can_be_recorded(function, transform, scene, torque):
     value, argument = function(scene, torque)
     assert jax.eval_shape(transform(value), argument).shape == argument.shape
