@@ -30,6 +30,9 @@ def optimise(
     knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase.")] = 51,
     steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 160,
     rate_limit: Annotated[float | None, typer.Option(min=1e-9, help="Largest torque rate [N m/s].")] = None,
+    margin: Annotated[
+        float | None, typer.Option(min=0.0, help="The shortest durations with at least this margin [N] everywhere.")
+    ] = None,
     passing: Annotated[
         float | None, typer.Option(min=0.0, help="Least speed at changes of formation, over the mean speed (0.2).")
     ] = None,
@@ -51,7 +54,7 @@ def optimise(
     loaded = load_scene(scene, set_)
     folder = make_output_folder(out)
     if robust:
-        others = (("rate-limit", rate_limit), ("passing", passing))
+        others = (("rate-limit", rate_limit), ("passing", passing), ("margin", margin))
         unknown = [name for name, value in others if value is not None]
         if unknown:
             raise BadInput(f"--robust: knows no --{unknown[0]}")
@@ -60,7 +63,7 @@ def optimise(
     from wholearm_jax.optimisation import MIN_TRANSITION_SPEED
 
     passing = MIN_TRANSITION_SPEED if passing is None else passing
-    options = {"knots": knots, "steps": steps, "rate_limit": rate_limit, "passing": passing}
+    options = {"knots": knots, "steps": steps, "rate_limit": rate_limit, "passing": passing, "margin": margin}
     begun = time.perf_counter()
     optimum = _optimise_scene(scene, loaded, options)
     more = {
@@ -69,7 +72,7 @@ def optimise(
         "steps": len(optimum.history),
         "seconds": time.perf_counter() - begun,
     }
-    more |= {"rate_limit": rate_limit, "passing": passing, "stopped": list(optimum.stopped)}
+    more |= {"rate_limit": rate_limit, "passing": passing, "wanted_margin": margin, "stopped": list(optimum.stopped)}
     if not as_json:
         _print_optimised(optimum)
     values = tuple(float(b.value) for b in optimum.bounds)
@@ -91,7 +94,12 @@ def _optimise_scene(name: str, scene, options: dict):
             progress.update(bars[step.phase], completed=step.iteration + 1, state=state)
 
         progress.update(bars[0], state="compiling")
-        optimum = solve(scene, **options, callback=show, traced=traced)
+        try:
+            optimum = solve(scene, **options, callback=show, traced=traced)
+        except ValueError as error:
+            if options["margin"] is None:
+                raise
+            raise BadInput(f"{name}: --margin: {error}") from None
         for bar, reason in zip(bars, optimum.stopped, strict=True):
             progress.update(bar, completed=options["steps"], state=reason)
     return optimum

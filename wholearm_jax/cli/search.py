@@ -18,7 +18,7 @@ def search(scene: SceneName, out: OutputFolder = None, samples: Samples = 201, a
     loaded = load_scene(scene)
     folder = make_output_folder(out)
     from wholearm_jax.core import wait_for
-    from wholearm_jax.optimisation import bounds, precompile_search, search_by_steps
+    from wholearm_jax.optimisation import certified_bounds, precompile_search, search_by_steps
 
     compiled = precompile_search()
     traced = trace_or_exit(scene, loaded)
@@ -30,6 +30,6 @@ def search(scene: SceneName, out: OutputFolder = None, samples: Samples = 201, a
     if not as_json:
         print_phases(optimum.result)
         print(f"{optimum.simulations} simulations in {optimum.seconds:.2f} s")
-    values = tuple(float(b.value) for b in bounds(optimum.result.scene, traced=traced))
+    values = tuple(float(b.value) for b in certified_bounds(optimum.result.scene, traced=traced))
     more = {"simulations": optimum.simulations, "seconds": optimum.seconds}
     write_and_exit(optimum.result, folder, samples, as_json, bounds=values, command="search", **more)

@@ -35,7 +35,7 @@ def simulate(
     loaded = load_scene(scene, set_)
     from wholearm_jax.core import wait_for
     from wholearm_jax.files import read_torque
-    from wholearm_jax.optimisation import bounds, explain
+    from wholearm_jax.optimisation import bounds, certified_bounds, explain
     from wholearm_jax.phases import precompile_simulate
 
     schedule = read_torque(torque)
@@ -48,7 +48,7 @@ def simulate(
     if not as_json:
         print_phases(result)
     gradient = _check_gradient(loaded, schedule, as_json) if check_gradient else {}
-    values = tuple(float(b.value) for b in margin_bounds)
+    values = tuple(float(b.value) for b in certified_bounds(loaded, traced=traced))
     more = {"command": "simulate", "torque": str(torque), "tolerance": tolerance} | gradient
     write_and_exit(result, folder, samples, as_json, bounds=values, **more)
 

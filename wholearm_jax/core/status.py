@@ -24,6 +24,7 @@ class Status(enum.IntEnum):
     NO_CONVERGENCE = 8
     MAX_STEPS = 9
     OBSTACLE = 10
+    TOO_SHORT = 11
 
     @property
     def label(self) -> str:
@@ -47,5 +48,6 @@ _ADVICE = {
     Status.SINGULAR: "rank is lost (wedging, fold, branch), or `toward` names a still coordinate; change the phase",
     Status.NO_CONVERGENCE: "Newton's method or the table did not converge; check the start, or refine the table",
     Status.OBSTACLE: "links meet or a joint's range ends: end the phase before with `until`, or change the hand",
+    Status.TOO_SHORT: "no torque within limits moves the object in so little time; give the phase more time",
     Status.MAX_STEPS: "the step limit was reached; raise it, or shorten the phase",
 }

@@ -6,8 +6,9 @@ reach what a motion along the path can.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -36,26 +37,40 @@ class Search:
     limits_rates: bool = False
 
 
-def explain(result: Result, *, margin_bounds: Sequence[MarginBound] = (), search: Search | None = None) -> Result:
+def explain(
+    result: Result,
+    *,
+    margin_bounds: Sequence[MarginBound] = (),
+    search: Search | None = None,
+    too_short: Mapping[int, float] = MappingProxyType({}),
+) -> Result:
     """Say of each phase that fails what the cause is, and advise what helps against it.
 
     Args:
         result: a simulated plan.
         margin_bounds: the result of `bounds`, to reuse it.
         search: how the optimiser searched its torques; None for torques from elsewhere.
+        too_short: the shortest duration [s] of phases for which nothing was searched, as no torques are so fast.
 
     Returns:
         The same result with `detail` and `remedy` of phases that fail on the way; others are as they were.
     """
     traced = tuple(phase.traced for phase in result.phases)
     failed = [k for k, phase in enumerate(result.phases) if _fails_on_its_way(phase)]
-    if not failed:
+    if not failed and not too_short:
         return result
     values = margin_bounds or bounds(result.scene, traced=traced)
-    open_ones = [k for k in failed if float(values[k].value) > 0 and result.phases[k].arrive is not Arrival.HOLD]
+    open_ones = [
+        k
+        for k in {*failed} - {*too_short}
+        if float(values[k].value) > 0 and result.phases[k].arrive is not Arrival.HOLD
+    ]
     fastest = shortest_motions(result.scene, 0.0, traced=traced) if open_ones else (None,) * len(traced)
     phases = list(result.phases)
-    for k in failed:
+    for k, shortest in too_short.items():
+        detail, remedy = _explain_motion(k, phases[k], shortest, search)
+        phases[k] = replace(phases[k], status=Status.TOO_SHORT, contact=None, slips=False, detail=detail, remedy=remedy)
+    for k in {*failed} - {*too_short}:
         motion = fastest[k]
         if float(values[k].value) <= 0:
             phases[k] = _explain_negative_bound(phases[k], values[k], traced[k])

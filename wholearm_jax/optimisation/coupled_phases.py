@@ -29,6 +29,7 @@ from wholearm_jax.model import (
     uniform_schedule,
 )
 from wholearm_jax.optimisation.constraints import Limits
+from wholearm_jax.optimisation.convex_start import ConvexStart, wait_before
 from wholearm_jax.optimisation.initial_guess import initial_guesses
 from wholearm_jax.optimisation.interior_point import interior_point
 from wholearm_jax.optimisation.multiple_shooting import extra_parts
@@ -43,7 +44,14 @@ GUESS_TORQUE_FRACTION = 0.9  # of the torque limits, that an initial guess may u
 MIN_DURATION_FRACTION = 0.01  # of its longest duration, that a phase takes at least
 GOOD_BOUND_FRACTION = 0.99  # of the bound, with which no further guess is tried
 
-GroupSolution = tuple[list[TorqueSchedule], str, list[IterationRecord]]  # schedules from time 0, why it ended, records
+
+class GroupSolution(NamedTuple):
+    """What was found for a group of phases."""
+
+    schedules: list[TorqueSchedule]  # of each phase, from time 0
+    reason: str  # why iterations ended
+    history: list[IterationRecord]
+    score: tuple[bool, float] = (False, -np.inf)  # whether the simulation is `ok`, and its least margin over its bound
 
 
 @dataclass(frozen=True)
@@ -71,6 +79,8 @@ class CoupledPhases:
     margin_bounds: list[MarginBound]
     begin: RestTransition | None  # to the first phase, where torque rates are limited and another stands before
     end: RestTransition | None  # from the last phase
+    convex: ConvexStart | None  # of a single phase
+    tries_profile: bool  # whether a smooth motion is tried as well
     options: OptimiseOptions
 
     @property
@@ -93,6 +103,8 @@ class CoupledPhases:
     def dwell_times(self) -> np.ndarray:
         """How long the object waits in each phase before it starts [s]."""
         first = self.begin.dwell_time if self.begin is not None else 0.0
+        if self.convex is not None and self.convex.wait is not None:
+            first += self.convex.wait.time
         return np.append(first, np.zeros(len(self.phases) - 1))
 
     @property
@@ -129,18 +141,21 @@ def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> GroupSolution:
     for path in group.traced:
         if int(path.dynamics.status) != Status.OK:
             reason = f"the path cannot be followed: {Status(int(path.dynamics.status)).label}"
-            return [uniform_schedule(t, np.zeros((options.knots, 2))) for t in group.moving_times], reason, []
+            schedules = [uniform_schedule(t, np.zeros((options.knots, 2))) for t in group.moving_times]
+            return GroupSolution(schedules, reason, [])
     phase_dynamics = [path.dynamics for path in group.traced]
-    guesses = initial_guesses(phase_dynamics, group.moving_times, options.knots, GUESS_TORQUE_FRACTION)
+    motion = None if group.convex is None else group.convex.motion
+    guesses = initial_guesses(phase_dynamics, group.moving_times, options.knots, GUESS_TORQUE_FRACTION, motion)
+    guesses = guesses if group.tries_profile else guesses[:1]
     if (reason := _infeasible_reason(group)) is not None:
-        return _schedules(group, guesses[0]), reason, []
+        return GroupSolution(_schedules(group, guesses[0]), reason, [])
 
     best, history = _solve_from_guesses(scene, group, guesses)
     near_bound = best.is_ok and best.bound_fraction >= 1 - options.tolerance
     reason = f"within {options.tolerance:g} of the bound" if near_bound else best.reason
     # Where iterations end without torques, the phase is simulated under those of its first guess, which are in limits.
     found = best.p if np.isfinite(np.asarray(best.p.torque)).all() else guesses[0]
-    return _schedules(group, found), reason, history
+    return GroupSolution(_schedules(group, found), reason, history, best[:2])
 
 
 class _Candidate(NamedTuple):
@@ -196,6 +211,8 @@ def _schedules(group: CoupledPhases, p: Variables) -> list[TorqueSchedule]:
     if group.begin is not None and group.begin.dwell_time > 0:
         times = np.append(0.0, group.begin.dwell_time + np.asarray(first.times))
         first = TorqueSchedule(as_device_array(times), as_device_array(np.vstack([group.begin.torque, first.values])))
+    if group.convex is not None and group.convex.wait is not None:
+        first = wait_before(group.convex.wait, first)
     return [first, *others]
 
 

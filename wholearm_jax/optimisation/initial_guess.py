@@ -18,7 +18,6 @@ from wholearm_jax.optimisation.constraints import impact_speed_ratio
 from wholearm_jax.optimisation.variables import Variables
 
 SPEED_PROFILES = tuple((p, q) for p in (1.0, 2.0, 4.0, 8.0, 16.0) for q in (1.0, 2.0, 4.0, 8.0, 16.0))
-FALLBACK_PROFILES = ((16.0, 1.0), (1.0, 1.0), (1.0, 16.0))  # further guesses: a long dwell first, none, a long one last
 PROFILE_SUBSTEPS = 8  # steps of an interval in which a profile's speed is integrated
 CUBIC_FRACTION = 0.3  # of a cubic motion in every profile, so that the object never quite stops on the way
 TRANSITION_SPEEDS = (1.0, 0.4, 2.0)  # at changes of contact formation [path lengths a duration]
@@ -29,21 +28,26 @@ UnitMotion = tuple[np.ndarray, np.ndarray, np.ndarray]  # s, v, a at the knots, 
 
 
 def initial_guesses(
-    phase_dynamics: list[PathDynamics], durations, knots: int, torque_fraction: float
+    phase_dynamics: list[PathDynamics],
+    durations,
+    knots: int,
+    torque_fraction: float,
+    convex: UnitMotion | None = None,
 ) -> list[Variables]:
     """Guess motions, with the torques that produce them.
 
-    A single phase goes from rest to rest: first with the profile of `SPEED_PROFILES` of the largest margin, then with
-    those of `FALLBACK_PROFILES`. Several go through their changes of contact formation at each of `TRANSITION_SPEEDS`.
+    A single phase goes from rest to rest: as the convex optimum does, then with the profile of `SPEED_PROFILES` of the
+    largest margin. Several go through their changes of contact formation at each of `TRANSITION_SPEEDS`.
 
     Args:
         phase_dynamics: path dynamics of each phase.
         durations: of each phase [s].
         knots: of each phase.
         torque_fraction: fraction of the torque limits that torques stay within.
+        convex: motion of the convex optimum of a single phase (`convex_start`); None: only the profile.
     """
     if len(phase_dynamics) == 1:
-        return _rest_to_rest_guesses(phase_dynamics[0], durations, knots, torque_fraction)
+        return _rest_to_rest_guesses(phase_dynamics[0], durations, knots, torque_fraction, convex)
     ratios = [float(_impact_speed_ratio(*pair)) for pair in itertools.pairwise(phase_dynamics)]
     guesses = []
     for speed in TRANSITION_SPEEDS:
@@ -54,13 +58,16 @@ def initial_guesses(
     return guesses
 
 
-def _rest_to_rest_guesses(dynamics: PathDynamics, durations, knots: int, torque_fraction: float) -> list[Variables]:
+def _rest_to_rest_guesses(
+    dynamics: PathDynamics, durations, knots: int, torque_fraction: float, convex: UnitMotion | None
+) -> list[Variables]:
     """Guess motions of a single phase."""
-    motions = _profile_motions(knots)
+    profiles = _profile_motions(knots)
+    motions = [*profiles, profiles[0] if convex is None else convex]  # always as many: one compiled program
     torque, margins = _quasistatic_torques(dynamics, durations[0], motions, torque_fraction)
+    margins = margins[: len(profiles)]
     best = 0 if margins[0] >= margins.max() - PROFILE_ADVANTAGE * abs(margins.max()) else int(np.argmax(margins))
-    others = [profile for profile in FALLBACK_PROFILES if SPEED_PROFILES[best] != profile]
-    order = [best, *map(SPEED_PROFILES.index, others)]
+    order = [best] if convex is None else [len(profiles), best]
     return [_variables([torque[k]], [motions[k]], durations) for k in order]
 
 

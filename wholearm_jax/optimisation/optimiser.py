@@ -5,7 +5,8 @@ How its modules work together:
 1. *Problems* (`coupled_phases`). Phases that start and end at rest are problems of their own, solved side by side;
    those that follow one another at speed are one problem. Where torque rates are limited, linear programmes first fix
    the torques between problems (`rest_transition`, `plan_transitions`). A phase that holds the object needs no more.
-2. *Initial guesses* (`initial_guess`): smooth motions with the best quasi-static torques.
+2. *Initial guesses* (`convex_start`, `initial_guess`): the motion of the convex optimum, with the best quasi-static
+   torques, and a smooth one. An object with much more time than it needs waits first, held by friction.
 3. *Multiple shooting* (`variables`, `multiple_shooting`). The variables `p` are the torques and states at the knots and
    the durations. Each interval between two knots is simulated from its own state; that it ends in the state at the next
    knot is an equation `e(p) = 0`. Instability of the motion thus cannot grow beyond one interval.
@@ -25,7 +26,7 @@ How its modules work together:
    steps come first; iterates that cycle are damped by half steps, a merit test and regularisation. Once the margin has
    settled, steps only close the equations. As `mu` falls, the iterates converge to the largest margin.
 9. *Verification*. A simulation of the schedule alone decides whether a solution counts and what its margin is. Where it
-   stays below the bound (`quasistatic_plan.bounds`), another initial guess is tried, until two agree.
+   stays below the bound (`plan_limits`), another initial guess is tried, until two agree.
 
 Derivation: sections 8 and 9 of `docs/derivation.md`.
 """
@@ -37,6 +38,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -44,8 +46,10 @@ import optax
 
 from wholearm_jax.core import Status, on_host, require_positive, require_x64, wait_for
 from wholearm_jax.margin import MarginBound
-from wholearm_jax.model import Arrival, Scene, TorqueSchedule, concatenate_schedules, replace_duration
+from wholearm_jax.model import Arrival, Scene, TorqueSchedule, concatenate_schedules, replace_duration, uniform_schedule
 from wholearm_jax.optimisation.advice import Search, explain
+from wholearm_jax.optimisation.best_motion import convex_bounds
+from wholearm_jax.optimisation.convex_start import ConvexStart, convex_starts
 from wholearm_jax.optimisation.coupled_phases import (
     MIN_DURATION_FRACTION,
     CoupledPhases,
@@ -54,10 +58,12 @@ from wholearm_jax.optimisation.coupled_phases import (
     group_phases,
     solve_coupled_phases,
 )
+from wholearm_jax.optimisation.plan_limits import tighten_bounds, too_short_phases
 from wholearm_jax.optimisation.plan_transitions import holding_schedule, rest_transitions
 from wholearm_jax.optimisation.precompilation import precompile_optimise, schedule_rows
 from wholearm_jax.optimisation.quasistatic_plan import bounds, require_knots
 from wholearm_jax.optimisation.rest_transition import RestTransition
+from wholearm_jax.optimisation.shortest_plan import shortest_plan
 from wholearm_jax.optimisation.solver import IterationRecord
 from wholearm_jax.phases import Result, TracedPhase, build_result, simulate_phases, trace
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
@@ -84,6 +90,14 @@ class OptimisationResult:
         return tuple(p.margin / float(b.value) if float(b.value) > 0 else float("nan") for p, b in pairs)
 
 
+class PlanLimits(NamedTuple):
+    """What no schedule of a plan can exceed."""
+
+    pointwise: tuple[MarginBound, ...]  # of each phase
+    bounds: tuple[MarginBound, ...]  # the smaller of that and the convex one
+    too_short: dict[int, float]  # shortest duration [s] of each phase that has less time
+
+
 @on_host("optimise outside, and transform wholearm_jax.margin with the schedule")
 def optimise(
     scene: Scene,
@@ -92,6 +106,7 @@ def optimise(
     steps: int = 160,
     rate_limit: float | None = None,
     durations: tuple[float, float] | None = None,
+    margin: float | None = None,
     passing: float = MIN_TRANSITION_SPEED,
     optimiser: optax.GradientTransformation | None = None,
     tolerance: float = 1e-3,
@@ -112,6 +127,7 @@ def optimise(
         rate_limit: largest torque rate [N m/s]. Torques then do not jump between phases either, and the object may
             wait, held by friction, for up to a quarter of a phase until the torque moves it (`rest_transition`).
         durations: (shortest, longest) [s], within which each phase chooses its own.
+        margin: least force of every contact [N]: find the shortest durations with it, in place of the scene's.
         passing: least speed with which a phase is entered at speed, over its mean speed: an object that hardly moves
             where its contact formation changes may as well stop short of it.
         optimiser: replaces the interior point by any optax optimiser (`projected_gradient`).
@@ -124,7 +140,7 @@ def optimise(
 
     Raises:
         RuntimeError: without float64.
-        ValueError: for fewer than two knots, and for numbers that are not positive.
+        ValueError: for fewer than two knots, for numbers that are not positive, and for a `margin` that no motion has.
 
     >>> optimum = wa.optimise(wa.load("heptagon"))
     >>> optimum.result.status.label, [f"{fraction:.2f}" for fraction in optimum.bound_fraction]
@@ -133,6 +149,8 @@ def optimise(
     require_x64(scene)
     require_knots(knots)
     require_positive(steps=steps, tolerance=tolerance, rate_limit=np.inf if rate_limit is None else rate_limit)
+    if margin is not None and (durations is not None or not margin >= 0):
+        raise ValueError("margin is a number of at least 0, and excludes durations")
     if durations is not None and not 0 < durations[0] <= durations[1]:
         raise ValueError("durations are (shortest, longest), positive and in this order")
     if durations is not None and durations[0] == durations[1]:
@@ -143,18 +161,31 @@ def optimise(
     traced = traced or trace(scene)
     if any(int(path.dynamics.status) == Status.OK for path in traced):
         wait_for(*compiled)
+    if margin is not None:
+        again = {"knots": knots, "steps": steps, "rate_limit": rate_limit, "passing": passing, "optimiser": optimiser}
+        solve = partial(optimise, **again, tolerance=tolerance, callback=callback, traced=traced)
+        return shortest_plan(solve, scene, margin, traced)
 
-    # A bound covers speeds up to multiples of a path length a duration: take the shortest that a phase may choose.
+    # The pointwise bound covers speeds up to multiples of a path length a duration: take the shortest that a phase may
+    # choose; for the convex one, the longest.
     shortest = scene
     if durations is not None:
         shortest = _with_durations(scene, max(durations[0], MIN_DURATION_FRACTION * durations[1]))
-    margin_bounds = bounds(shortest, traced=traced)
+    pointwise, longest = bounds(shortest, traced=traced), scene
+    if durations is not None:
+        longest = _with_durations(scene, durations[1])
+    motions = convex_bounds(longest, traced=traced)
+    limits = PlanLimits(
+        pointwise,
+        tighten_bounds(pointwise, motions, traced),
+        too_short_phases(longest, pointwise, motions, traced),
+    )
 
     rows, heard = schedule_rows(scene, knots), callback and _one_at_a_time(callback)
     options = OptimiseOptions(knots, rows, steps, rate_limit, durations, passing, optimiser, tolerance, heard)
     results = []
     for max_dwell in MAX_DWELLS if rate_limit is not None else MAX_DWELLS[:1]:
-        results.append(_solve_plan(scene, traced, margin_bounds, options, max_dwell))
+        results.append(_solve_plan(scene, traced, limits, options, max_dwell))
         if results[-1].result.status is Status.OK:
             return results[-1]
     return max(results, key=lambda plan: plan.result.margin)
@@ -163,22 +194,22 @@ def optimise(
 def _solve_plan(
     scene: Scene,
     traced: tuple[TracedPhase, ...],
-    margin_bounds: tuple[MarginBound, ...],
+    limits: PlanLimits,
     options: OptimiseOptions,
     max_dwell: float,
 ) -> OptimisationResult:
     """Solve all groups of phases side by side, with dwells of at most a fraction `max_dwell` of a phase."""
-    groups = group_phases(scene)
+    groups, margin_bounds = group_phases(scene), limits.bounds
     transitions: list[RestTransition | None] = [None] * (len(groups) - 1)
     if options.rate_limit is not None:
-        limits = options.rate_limit, max_dwell, options.durations
-        transitions = rest_transitions(scene, groups, traced, margin_bounds, *limits)
+        ranges = options.rate_limit, max_dwell, options.durations
+        transitions = rest_transitions(scene, groups, traced, margin_bounds, *ranges)
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        solve_group = partial(_solve_group, scene, traced, margin_bounds, options)
+        solve_group = partial(_solve_group, scene, traced, limits, options)
         solutions = list(threads.map(solve_group, groups, itertools.pairwise([None, *transitions, None])))
-    schedules = [schedule for of_group, _, _ in solutions for schedule in of_group]
-    stopped = [reason for of_group, reason, _ in solutions for _ in of_group]
-    history = [record for *_, records in solutions for record in records]
+    schedules = [schedule for found in solutions for schedule in found.schedules]
+    stopped = [found.reason for found in solutions for _ in found.schedules]
+    history = [record for found in solutions for record in found.history]
 
     # Simulate the whole plan.
     durations = [float(np.asarray(schedule.times)[-1]) for schedule in schedules]
@@ -186,14 +217,15 @@ def _solve_plan(
     scene, torque = eqx.tree_at(lambda s: s.phases, scene, phases), concatenate_schedules(schedules)
     simulated = simulate_phases(scene, torque, traced, with_step_capacity(IntegratorOptions(), options.knots))
     search = Search(options.knots, options.rate_limit is not None)
-    result = explain(build_result(scene, torque, traced, simulated), margin_bounds=margin_bounds, search=search)
+    result = build_result(scene, torque, traced, simulated)
+    result = explain(result, margin_bounds=limits.pointwise, search=search, too_short=limits.too_short)
     return OptimisationResult(scene, torque, result, margin_bounds, tuple(stopped), tuple(history))
 
 
 def _solve_group(
     scene: Scene,
     traced: tuple[TracedPhase, ...],
-    margin_bounds: tuple[MarginBound, ...],
+    limits: PlanLimits,
     options: OptimiseOptions,
     group: list[int],
     ends: tuple[RestTransition | None, RestTransition | None],
@@ -202,9 +234,26 @@ def _solve_group(
     phases, paths = tuple(scene.phases[k] for k in group), [traced[k] for k in group]
     if phases[0].arrive is Arrival.HOLD:
         schedule = holding_schedule(scene, phases[0], paths[0], options.knots, options.rate_limit, *ends)
-        return [schedule], "the best torque of a linear programme", []
-    coupled = CoupledPhases(group[0], phases, paths, [margin_bounds[k] for k in group], *ends, options)
-    return solve_coupled_phases(scene, coupled)
+        return GroupSolution([schedule], "the best torque of a linear programme", [])
+    short = [k for k in group if k in limits.too_short]
+    if short:
+        schedules = [uniform_schedule(float(phase.duration), np.zeros((options.knots, 2))) for phase in phases]
+        return GroupSolution(schedules, f"phase '{scene.phases[short[0]].name}' is too short for any motion", [])
+    margin_bounds: list[MarginBound] = [limits.bounds[k] for k in group]
+    starts: list[ConvexStart] = []
+    if len(group) == 1 and int(paths[0].dynamics.status) == Status.OK and float(margin_bounds[0].value) > 0:
+        may_wait = options.rate_limit is None and options.durations is None
+        moving = float(phases[0].duration) - (ends[0].dwell_time if ends[0] is not None else 0.0)
+        starts = convex_starts(scene, phases[0], paths[0], moving, options.knots, may_wait)
+    solutions: list[GroupSolution] = []
+    for convex in starts or [None]:
+        only = len(starts) <= 1
+        coupled = CoupledPhases(group[0], phases, paths, margin_bounds, *ends, convex, only, options)
+        solutions.append(solve_coupled_phases(scene, coupled))
+        if solutions[-1].score >= (True, 1 - options.tolerance):
+            break
+    best = max(solutions, key=lambda found: found.score)
+    return best._replace(history=[record for found in solutions for record in found.history])
 
 
 def _one_at_a_time(callback: Callable[[IterationRecord], None]) -> Callable[[IterationRecord], None]:

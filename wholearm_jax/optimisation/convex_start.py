@@ -1,0 +1,101 @@
+"""Where the descent starts: the convex optimum of a phase, and how long the object should move.
+
+A phase that may take much longer than its optimum needs moves for a part of its duration only, and waits before, held
+by friction, where the contacts hold the object at rest with no smaller margin than in motion.
+
+Derivation: section 8 of `docs/derivation.md`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from wholearm_jax.core import as_device_array
+from wholearm_jax.margin import PROGRAMME_INTERVALS, PathOptimum, rest_to_rest
+from wholearm_jax.model import Phase, Scene, TorqueSchedule, concatenate_schedules, torque_schedule
+from wholearm_jax.optimisation.best_motion import path_duration, path_margin
+from wholearm_jax.optimisation.initial_guess import UnitMotion
+from wholearm_jax.optimisation.quasistatic_plan import rolling_count
+from wholearm_jax.phases import TracedPhase, statics_at_start
+
+NEAR_MARGIN = 0.99  # fraction of the largest margin that the shortest sensible motion reaches
+GOOD_MOVING_TIME = 1.5  # time of a motion after a wait, over the shortest sensible one
+MAX_MOVING_TIME = 8.0  # longest motion without a wait, over the shortest sensible one; knots resolve no longer one
+
+
+class Wait(NamedTuple):
+    """The object waits, held by friction, before it moves."""
+
+    time: float  # [s]
+    torque: Float[np.ndarray, "2"]  # [N m]
+
+
+class ConvexStart(NamedTuple):
+    """The convex optimum of a phase from rest to rest."""
+
+    motion: UnitMotion  # at evenly spaced knots
+    wait: Wait | None  # None: the object moves at once
+
+
+def convex_starts(
+    scene: Scene, phase: Phase, traced: TracedPhase, duration: float, knots: int, may_wait: bool
+) -> list[ConvexStart]:
+    """Solve the convex programme of one phase from rest to rest.
+
+    Args:
+        scene: the plan.
+        phase: one of its phases.
+        traced: its path.
+        duration: of the phase [s].
+        knots: torque knots of the phase.
+        may_wait: whether the object may wait before it moves.
+
+    Returns:
+        The starts to try in turn: moving for the whole duration unless that is very long, then after a wait where there
+        is time and that costs no margin. None where no motion from rest to rest takes so little time.
+    """
+    rest, dynamics, rolling = rest_to_rest(), traced.dynamics, rolling_count(phase)
+
+    def optimum(time: float) -> PathOptimum:
+        return path_margin(dynamics, as_device_array(time), rest, PROGRAMME_INTERVALS, rolling)
+
+    whole = optimum(duration)
+    if not bool(whole.converged):
+        return []
+    starts = [ConvexStart(_unit_motion(whole, traced, knots), None)]
+    if not may_wait:
+        return starts
+    near = as_device_array(NEAR_MARGIN * float(whole.margin))
+    sensible = path_duration(dynamics, near, rest, PROGRAMME_INTERVALS, rolling)
+    moving = GOOD_MOVING_TIME * float(sensible.duration)
+    if not bool(sensible.converged) or duration <= moving:
+        return starts
+    statics, accelerations = statics_at_start(scene, phase, traced)
+    hold = statics.most_central_torque(accelerations)
+    if not hold.margin >= float(whole.margin):
+        return starts
+    waiting = ConvexStart(_unit_motion(optimum(moving), traced, knots), Wait(duration - moving, hold.torque))
+    is_long = duration > MAX_MOVING_TIME * float(sensible.duration)
+    return [waiting] if is_long else [*starts, waiting]
+
+
+def wait_before(wait: Wait, schedule: TorqueSchedule) -> TorqueSchedule:
+    """Return a schedule that holds the object first, and then steps to the given one."""
+    held = torque_schedule([0.0, wait.time], [wait.torque, wait.torque])
+    return concatenate_schedules([held, schedule])
+
+
+def _unit_motion(optimum: PathOptimum, traced: TracedPhase, knots: int) -> UnitMotion:
+    """Sample an optimum at even times: place, speed and acceleration over unit length and time."""
+    time, s, v = (np.asarray(a) for a in (optimum.time, optimum.node_s, optimum.speed))
+    length, duration = float(traced.dynamics.length), time[-1]
+    u = np.linspace(0.0, 1.0, knots)
+
+    # The speed is linear in time within an interval: the place is quadratic.
+    k = np.clip(np.searchsorted(time, u * duration, side="right") - 1, 0, len(time) - 2)
+    x = (u * duration - time[k]) / (time[k + 1] - time[k])
+    covered = (v[k] * x + (v[k + 1] - v[k]) * x**2 / 2) / ((v[k] + v[k + 1]) / 2)
+    place = (s[k] + covered * (s[k + 1] - s[k]) - s[0]) / length
+    speed = (v[k] + (v[k + 1] - v[k]) * x) * duration / length
+    return place, speed, np.gradient(speed, u)

@@ -1,0 +1,72 @@
+"""What no schedule can exceed: the bound of each phase's margin in its duration, and the shortest duration.
+
+The bound is the smaller of the pointwise one (`quasistatic_plan.bounds`) and the margin of the convex optimum.
+"""
+
+from wholearm_jax.core import as_device_array
+from wholearm_jax.margin import MarginBound
+from wholearm_jax.model import Scene
+from wholearm_jax.optimisation.best_motion import BestMotion, convex_bounds, shortest_motions
+from wholearm_jax.optimisation.quasistatic_plan import bounds
+from wholearm_jax.phases import TracedPhase, trace
+
+
+def certified_bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[MarginBound, ...]:
+    """Return for each phase the smaller of its pointwise bound and its convex one, in the phase's duration.
+
+    Where no motion takes so little time, it is the pointwise bound.
+
+    Args:
+        scene: the plan.
+        traced: the result of `trace`, to reuse it.
+
+    Returns:
+        One `MarginBound` a phase: `value` [N], and where on the path it is tight.
+
+    Raises:
+        RuntimeError: without float64.
+    """
+    traced = traced or trace(scene)
+    return tighten_bounds(bounds(scene, traced=traced), convex_bounds(scene, traced=traced), traced)
+
+
+def tighten_bounds(
+    pointwise: tuple[MarginBound, ...], motions: tuple[BestMotion | None, ...], traced: tuple[TracedPhase, ...]
+) -> tuple[MarginBound, ...]:
+    """Return the smaller of each phase's pointwise bound and the margin of its best motion, where that is feasible."""
+
+    def tighter(bound: MarginBound, motion: BestMotion | None, path: TracedPhase) -> MarginBound:
+        if motion is None or not motion.feasible or not 0 < motion.margin < float(bound.value):
+            return bound
+        s = path.dynamics.breakpoints[0] + motion.hardest_place * path.dynamics.length
+        return MarginBound(*(as_device_array(a) for a in (motion.margin, s, motion.hardest_place)))
+
+    return tuple(tighter(*row) for row in zip(pointwise, motions, traced, strict=True))
+
+
+def too_short_phases(
+    scene: Scene,
+    pointwise: tuple[MarginBound, ...],
+    motions: tuple[BestMotion | None, ...],
+    traced: tuple[TracedPhase, ...],
+) -> dict[int, float]:
+    """Return the shortest duration [s] of each phase in whose duration no torque within limits can move the object.
+
+    Args:
+        scene: the plan.
+        pointwise: bounds of its phases.
+        motions: the best motions in the phases' durations.
+        traced: of each phase.
+    """
+
+    def lacks_time(bound: MarginBound, motion: BestMotion | None) -> bool:
+        return motion is not None and float(bound.value) > 0 and not (motion.feasible and motion.margin > 0)
+
+    if not any(lacks_time(*pair) for pair in zip(pointwise, motions, strict=True)):
+        return {}
+    found = {}
+    for k, fastest in enumerate(shortest_motions(scene, 0.0, traced=traced)):
+        short = fastest is not None and fastest.feasible and float(scene.phases[k].duration) < fastest.duration
+        if fastest is not None and short and lacks_time(pointwise[k], motions[k]):
+            found[k] = fastest.duration
+    return found
