@@ -19,9 +19,9 @@ from wholearm_jax.optimisation.initial_guess import UnitMotion
 from wholearm_jax.optimisation.quasistatic_plan import rolling_count
 from wholearm_jax.phases import TracedPhase, statics_at_start
 
-NEAR_MARGIN = 0.99  # fraction of the largest margin that the shortest sensible motion reaches
-GOOD_MOVING_TIME = 1.5  # time of a motion after a wait, over the shortest sensible one
-MAX_MOVING_TIME = 8.0  # longest motion without a wait, over the shortest sensible one; knots resolve no longer one
+NEAR_MARGIN = 0.999  # fraction of the largest margin that the shortest sensible motion reaches
+GOOD_MOVING_TIME = 1.25  # time of a motion after a wait, over the shortest sensible one
+MAX_MOVING_TIME = 6.0  # longest motion without a wait, over the shortest sensible one; knots resolve no longer one
 
 
 class Wait(NamedTuple):
