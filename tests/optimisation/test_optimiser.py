@@ -32,7 +32,7 @@ def test_every_phase_reaches_99_percent_of_the_bound(optimised):
     name, _, found = optimised
     for phase, top, known in zip(found.result.phases, found.bounds, BOUNDS[name], strict=True):
         assert phase.status is wa.Status.OK
-        assert float(top.value) == pytest.approx(known, abs=6e-4)
+        assert 0.99 * known <= float(top.value) <= known + 6e-4
         assert phase.margin >= 0.99 * float(top.value)
         assert phase.margin <= float(top.value) + 1e-9, "no torque can beat the bound"
 
@@ -60,7 +60,7 @@ def test_history_says_what_happened(optimised):
 
 
 def test_a_start_that_leads_to_a_known_end_is_not_followed_to_it():
-    """At this pace both phases stay below 99 % of their bounds, and a second start says whether that is all."""
+    """At this pace, where no wait helps, a phase below its bound has a second start, which says whether that is all."""
     scene = layered("heptagon")
     for k in range(2):
         scene = eqx.tree_at(lambda s, k=k: s.phases[k].duration, scene, jnp.asarray(0.15))
@@ -89,10 +89,11 @@ def test_phases_side_by_side_are_what_each_is_alone(optimised):
     paths = tuple(phase.traced for phase in both.result.phases)
     again = wa.optimise(scene, traced=paths, callback=hear)
     assert sorted(heard) == sorted((s.phase, s.start, s.iteration, s.margin) for s in again.history)
-    rows = both.torque.values.reshape(len(paths), -1, 2)
-    for phase, path, values in zip(scene.phases, paths, rows, strict=True):
-        alone = wa.optimise(eqx.tree_at(lambda s: s.phases, scene, (phase,)), traced=(path,))
-        assert np.array_equal(alone.torque.values, values)
+    each = [
+        wa.optimise(eqx.tree_at(lambda s: s.phases, scene, (phase,)), traced=(path,)).torque.values
+        for phase, path in zip(scene.phases, paths, strict=True)
+    ]
+    assert np.array_equal(np.concatenate(each), both.torque.values)
 
 
 def test_the_search_is_beaten_in_margin(optimised):

@@ -81,6 +81,7 @@ class CoupledPhases:
     end: RestTransition | None  # from the last phase
     convex: ConvexStart | None  # of a single phase
     tries_profile: bool  # whether a smooth motion is tried as well
+    first_guess: int  # number of the first initial guess
     options: OptimiseOptions
 
     @property
@@ -187,7 +188,7 @@ def _solve_from_guesses(
     method = solver_method(options.optimiser, len(group.phases), extra_parts(stacked))
     candidates: list[_Candidate] = []
     history: list[IterationRecord] = []
-    for number, guess in enumerate(guesses):
+    for number, guess in enumerate(guesses, group.first_guess):
         for at, torque in group.fixed_torques.items():
             guess = eqx.tree_at(lambda p: p.torque, guess, guess.torque.at[at].set(torque))
         solutions = [known.p for known in candidates if known.is_ok and known.reason == CONVERGED]

@@ -144,7 +144,7 @@ def optimise(
 
     >>> optimum = wa.optimise(wa.load("heptagon"))
     >>> optimum.result.status.label, [f"{fraction:.2f}" for fraction in optimum.bound_fraction]
-    ('ok', ['1.00', '0.95'])
+    ('ok', ['1.00', '1.00'])
     """
     require_x64(scene)
     require_knots(knots)
@@ -247,8 +247,8 @@ def _solve_group(
         starts = convex_starts(scene, phases[0], paths[0], moving, options.knots, may_wait)
     solutions: list[GroupSolution] = []
     for convex in starts or [None]:
-        only = len(starts) <= 1
-        coupled = CoupledPhases(group[0], phases, paths, margin_bounds, *ends, convex, only, options)
+        only, tried = len(starts) <= 1, len(solutions)
+        coupled = CoupledPhases(group[0], phases, paths, margin_bounds, *ends, convex, only, tried, options)
         solutions.append(solve_coupled_phases(scene, coupled))
         if solutions[-1].score >= (True, 1 - options.tolerance):
             break
