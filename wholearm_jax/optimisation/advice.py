@@ -60,17 +60,14 @@ def explain(
     if not failed and not too_short:
         return result
     values = margin_bounds or bounds(result.scene, traced=traced)
-    open_ones = [
-        k
-        for k in {*failed} - {*too_short}
-        if float(values[k].value) > 0 and result.phases[k].arrive is not Arrival.HOLD
-    ]
+    searched = [k for k in failed if k not in too_short]
+    open_ones = [k for k in searched if float(values[k].value) > 0 and result.phases[k].arrive is not Arrival.HOLD]
     fastest = shortest_motions(result.scene, 0.0, traced=traced) if open_ones else (None,) * len(traced)
     phases = list(result.phases)
     for k, shortest in too_short.items():
         detail, remedy = _explain_motion(k, phases[k], shortest, search)
         phases[k] = replace(phases[k], status=Status.TOO_SHORT, contact=None, slips=False, detail=detail, remedy=remedy)
-    for k in {*failed} - {*too_short}:
+    for k in searched:
         motion = fastest[k]
         if float(values[k].value) <= 0:
             phases[k] = _explain_negative_bound(phases[k], values[k], traced[k])
@@ -97,7 +94,7 @@ def _explain_motion(number: int, phase: PhaseResult, fastest: float, search: Sea
     if math.isinf(fastest):
         return "within the torque limits no motion presses every contact, however long it takes", REMEDY_LIMITS
     if fastest > phase.duration:
-        detail = f"faster than the torques allow: the phase takes {fastest:.3g} s or longer, not {phase.duration:.3g} s"
+        detail = f"faster than the torques allow: the phase takes {fastest:.4g} s or longer, not {phase.duration:.4g} s"
         return detail, f"give it more time ({longer})"
     if search is None:
         return phase.detail, f"{_first_half(phase)}; {REMEDY_OPTIMISE}"
@@ -116,9 +113,9 @@ def _first_half(phase: PhaseResult) -> str:
     return phase.status.advice.partition(";")[0]
 
 
-def round_up_digits(value: float, digits: int = 2) -> float:
+def round_up_digits(value: float, significant: int = 2) -> float:
     """Round a positive number up to so many significant digits."""
-    unit = 10.0 ** (math.floor(math.log10(value)) - digits + 1)
+    unit = 10.0 ** (math.floor(math.log10(value)) - significant + 1)
     return math.ceil(value / unit - 1e-9) * unit
 
 
