@@ -15,6 +15,7 @@ twentieths of a phase at its ends are left out, where soft contacts take over); 
 """
 
 import argparse
+import itertools
 import json
 import os
 import resource
@@ -239,9 +240,9 @@ def by_coulomb(ensemble, torque) -> dict:
     begins, step = clock(ensemble.scene, wanted)
     copies = [(build_mujoco_model(s, step), start) for s, start in zip(scenes, starts, strict=True)]
     torques, workers = motor_torques(torque, begins, step), os.cpu_count() or 1
-    list(driven(copies[:workers], torques[:10], workers))  # starts the processes
+    list(driven(copies[:workers], itertools.repeat(torques[:10]), workers))  # starts the processes
     begun = time.perf_counter()
-    list(driven(copies, torques, workers))
+    list(driven(copies, itertools.repeat(torques), workers))
     rate = ROLLOUTS / (time.perf_counter() - begun)
     print(f"free bodies at {step:g} s: {rate:.2f} a second, margin {100 * error:.2g} % off", flush=True)
     return {"timestep": step, "rate": rate, "margin_error": error}

@@ -2,8 +2,8 @@
 
 Read the folders in this order: `core`, `model` (what a scene is), `tracing` (the path of a contact formation),
 `dynamics` (the equations of motion along it), `simulation`, `margin` (contact forces and their minimum), `phases` (one
-after the other), `optimisation`, `planning`, `ensembles` (many scenes), `execution` (virtual hardware), `files`,
-`plotting`, `report` and `cli`. Each imports only from those above it.
+after the other), `optimisation`, `planning`, `feedback`, `ensembles` (many scenes), `execution` (virtual hardware),
+`files`, `plotting`, `report` and `cli`. Each imports only from those above it.
 """
 
 import warnings
@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import wholearm_jax.cli.interruption  # noqa: F401, first: a command may be interrupted while the rest is imported
 from wholearm_jax.core import Status, configure
 from wholearm_jax.ensembles import check
-from wholearm_jax.files import load, parse, read_torque, save, write_torque
+from wholearm_jax.feedback import Controller, feedback
+from wholearm_jax.files import load, parse, read_controller, read_torque, save, write_controller, write_torque
 from wholearm_jax.model import Scene, TorqueSchedule, torque_schedule
 from wholearm_jax.optimisation import (
     bounds,
@@ -27,6 +28,7 @@ from wholearm_jax.planning import plan
 from wholearm_jax.simulation import IntegratorOptions
 
 __all__ = [
+    "Controller",
     "IntegratorOptions",
     "Scene",
     "Status",
@@ -35,12 +37,14 @@ __all__ = [
     "check",
     "configure",
     "convex_bounds",
+    "feedback",
     "load",
     "margin",
     "optimise",
     "parse",
     "plan",
     "quasistatic",
+    "read_controller",
     "read_torque",
     "save",
     "search_by_steps",
@@ -49,6 +53,7 @@ __all__ = [
     "torque_schedule",
     "trace",
     "trajectory",
+    "write_controller",
     "write_torque",
 ]
 

@@ -7,10 +7,10 @@ from typing import Annotated
 import typer
 
 from wholearm_jax.cli.arguments import (
+    TORQUE_HELP,
     AsJson,
     BadInput,
     SceneName,
-    TorqueFile,
     load_scene,
     make_output_folder,
     refuse_unwritable,
@@ -24,7 +24,8 @@ from wholearm_jax.cli.tables import print_json
 
 def execute(
     scene: SceneName,
-    torque: TorqueFile,
+    torque: Annotated[Path | None, typer.Option("--torque", help=TORQUE_HELP)] = None,
+    controller: Annotated[Path | None, typer.Option(help="A controller.json: execute in closed loop.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for execution.json, .csv, figures and model.xml.")] = None,
     timestep: Annotated[float, typer.Option(min=1e-6, max=1e-2, help="Time step [s].")] = 2e-4,
     position: Annotated[float, typer.Option(min=0.0, help="Success: this near the predicted end [m].")] = 5e-4,
@@ -36,31 +37,44 @@ def execute(
     mass: Annotated[str, typer.Option(help="Perturbation of the mass, e.g. 5%.")] = "5%",
     geometry: Annotated[float, typer.Option(min=0.0, help="Perturbation of the vertices [m].")] = 5e-4,
     start: Annotated[float, typer.Option(min=0.0, help="Perturbation of the start [m].")] = 5e-4,
+    rate: Annotated[float, typer.Option(min=1.0, help="Sampling rate of the controller [Hz].")] = 1000.0,
+    delay: Annotated[float, typer.Option(min=0.0, help="From measurement to torque [s].")] = 1e-3,
+    counts: Annotated[int, typer.Option(min=0, help="Encoder counts a turn (0: exact).")] = 4096,
+    torque_noise: Annotated[float, typer.Option(min=0.0, help="Standard deviation, a share of the torque.")] = 0.01,
     as_json: AsJson = False,
 ) -> None:
-    """Execute a torque schedule open loop on free bodies with soft contacts, in MuJoCo."""
+    """Execute a torque schedule open loop, or a controller, on free bodies with soft contacts, in MuJoCo."""
+    if (torque is None) == (controller is None):
+        raise BadInput("give either --torque FILE or --controller FILE")
     if video and out is None:
         raise BadInput("--video: needs a folder to write to: add --out DIR")
     fractions = _fraction("--friction", friction), _fraction("--mass", mass)
     loaded = load_scene(scene)
     try:
-        from wholearm_jax.execution import Amounts, ExecutionOutcome, Tolerance, require_objects, require_wires
+        from wholearm_jax.execution import (
+            Amounts,
+            ExecutionOutcome,
+            Hardware,
+            Tolerance,
+            require_objects,
+            require_wires,
+        )
         from wholearm_jax.execution import execute as rollout
     except ModuleNotFoundError as error:
         if error.name not in ("mujoco", "joblib"):
             raise
         raise BadInput("execution needs MuJoCo: pip install 'wholearm_jax[mujoco]'") from None
-    from wholearm_jax.files import EXECUTION_FILES, execution_summary, read_torque
+    from wholearm_jax.files import EXECUTION_FILES, execution_summary
 
-    schedule, amounts = read_torque(torque), Amounts(*fractions, geometry, start)
+    amounts, hardware = Amounts(*fractions, geometry, start), Hardware(rate, delay, counts, torque_noise)
     if perturb:
         try:
             require_objects(loaded, amounts)
         except ValueError as error:
             raise BadInput(f"--{error}") from None
     folder = make_output_folder(out)
-    prediction = simulate_or_exit(loaded, schedule, torque, 1e-10, trace_or_exit(scene, loaded))
-    if not as_json:
+    prediction, law = _predict(scene, loaded, torque, controller)
+    if not as_json and law is None:
         print(f"predicted: {prediction.message}")
     try:
         require_wires(prediction)
@@ -68,10 +82,11 @@ def execute(
         if as_json:
             print_json({"prediction": {"status": prediction.status.label, "message": prediction.message}})
         sys.exit(1)
-    settings = {"timestep": timestep, "tolerance": Tolerance(position, angle)}
-    execution = rollout(prediction, **settings)
+    settings = {"timestep": timestep, "tolerance": Tolerance(position, angle), "controller": law, "hardware": hardware}
+    execution = rollout(prediction, seed=seed, **settings)
     trials = _run_trials(prediction, perturb, amounts, seed=seed, **settings) if perturb else None
-    content = execution_summary(execution, trials, torque=str(torque))
+    more = {"torque": str(torque)} if law is None else {"controller": str(controller), "hardware": hardware._asdict()}
+    content = execution_summary(execution, trials, **more)
     ok = execution.ending is ExecutionOutcome.OK
     folder = folder if folder and may_replace(folder, EXECUTION_FILES, ok) else None
     if folder is not None:
@@ -81,6 +96,27 @@ def execute(
     else:
         _print_execution(execution, trials, folder)
     sys.exit(0 if ok else 1)
+
+
+def _predict(name: str, scene, torque: Path | None, controller: Path | None):
+    """Return the prediction to compare with, and the controller.
+
+    That of a controller is the plan under the quasi-static torques: where the paths begin and end is the same for all.
+    """
+    from wholearm_jax.execution import require_same_plan
+    from wholearm_jax.files import read_controller, read_torque
+    from wholearm_jax.optimisation import quasistatic
+
+    if torque is not None:
+        return simulate_or_exit(scene, read_torque(torque), torque, 1e-10, trace_or_exit(name, scene)), None
+    assert controller is not None
+    law = read_controller(controller)
+    try:
+        require_same_plan(law, scene)
+    except ValueError as error:
+        raise BadInput(f"{controller}: {error}") from None
+    traced = trace_or_exit(name, scene)
+    return simulate_or_exit(scene, quasistatic(scene, traced=traced), controller, 1e-10, traced), law
 
 
 def _fraction(option: str, text: str) -> float:

@@ -21,6 +21,7 @@ from wholearm_jax.cli.arguments import (
 from wholearm_jax.cli.output import write_and_exit, write_result
 from wholearm_jax.cli.prediction import trace_or_exit
 from wholearm_jax.cli.progress import solver_progress
+from wholearm_jax.core import Status
 
 
 def optimise(
@@ -45,12 +46,17 @@ def optimise(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the varied scenes.")] = 0,
     arrival: Annotated[float, typer.Option(min=1e-9, max=1.0, help="As of `check`, for --robust.")] = ARRIVAL_FRACTION,
+    feedback: Annotated[
+        bool, typer.Option("--feedback", help="Also controller.json, a closed-loop law for the plan.")
+    ] = False,
     report: Annotated[bool, typer.Option("--report", help="Also report.html, one page with an animation.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Find the torques with the largest compressive margin, and check them by simulation."""
     if report and out is None:
         raise BadInput("--report: needs a folder to write to: add --out DIR")
+    if feedback and (out is None or robust):
+        raise BadInput("--feedback: knows no --robust" if robust else "--feedback: needs --out DIR to write to")
     loaded = load_scene(scene, set_)
     folder = make_output_folder(out)
     if robust:
@@ -76,7 +82,19 @@ def optimise(
     if not as_json:
         _print_optimised(optimum)
     values = tuple(float(b.value) for b in optimum.bounds)
-    write_and_exit(optimum.result, folder, samples or 201, as_json, report=report, bounds=values, **more)
+    controller = _design(optimum, as_json) if feedback and optimum.result.status is Status.OK else None
+    more |= {"controller": controller, "bounds": values}
+    write_and_exit(optimum.result, folder, samples or 201, as_json, report=report, **more)
+
+
+def _design(optimum, as_json: bool):
+    """Design the closed-loop law of an optimised plan, and say which margin each phase keeps."""
+    from wholearm_jax.feedback import feedback
+
+    controller = feedback(optimum.scene, optimum.torque)
+    for phase in controller.phases if not as_json else ():
+        print(f"{phase.name}: closed loop, least force {phase.margin:.4g} N over the friction of all links +-20 %")
+    return controller
 
 
 def _optimise_scene(name: str, scene, options: dict):

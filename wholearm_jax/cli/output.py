@@ -22,7 +22,9 @@ def write_and_exit(result, folder: Path | None, samples: int, as_json: bool, rep
     sys.exit(0 if result.status.value == 0 else 1)
 
 
-def write_result(result, folder: Path | None, samples: int, as_json: bool, report: bool = False, **more) -> None:
+def write_result(
+    result, folder: Path | None, samples: int, as_json: bool, report: bool = False, controller=None, **more
+) -> None:
     """Write the files in place of those of an earlier result, and print the result's message or the summary.
 
     A result without torques is not written, and one that is not `ok` not over one that is: notes say so.
@@ -39,7 +41,7 @@ def write_result(result, folder: Path | None, samples: int, as_json: bool, repor
     elif folder is not None and not may_replace(folder, RESULT_FILES, result.status.value == 0):
         folder = None
     if folder is not None:
-        _write_files(result, content, folder, samples, report)
+        _write_files(result, content, folder, samples, report, controller)
     if as_json:
         print_json(content)
     else:
@@ -56,14 +58,23 @@ def may_replace(folder: Path, files, ok: bool) -> bool:
     return False
 
 
-def _write_files(result, content: dict, folder: Path, samples: int, report: bool) -> None:
+def _write_files(result, content: dict, folder: Path, samples: int, report: bool, controller) -> None:
     """Write the files of a result and its figures."""
-    from wholearm_jax.files import RESULT_FILES, replace_files, write_summary, write_torque, write_trajectory
+    from wholearm_jax.files import (
+        RESULT_FILES,
+        replace_files,
+        write_controller,
+        write_summary,
+        write_torque,
+        write_trajectory,
+    )
 
     with refuse_unwritable(f"--out {folder}"), replace_files(folder, RESULT_FILES) as scratch:
         write_torque(result.torque, scratch / "torque.csv")
         write_trajectory(result, scratch / "trajectory.csv", samples)
         write_summary(content, scratch / "summary.json")
+        if controller is not None:
+            write_controller(controller, scratch / "controller.json")
         _write_figures(result, scratch)
         if report:
             write_report(scratch, scratch / "report.html")

@@ -1,5 +1,6 @@
 """Virtual hardware: a MuJoCo model with Coulomb friction, rollouts, trials. Needs the extra `mujoco`."""
 
+from wholearm_jax.execution.closed_loop import IDEAL, Hardware, require_same_plan
 from wholearm_jax.execution.executions import (
     Execution,
     ExecutionOutcome,
@@ -14,6 +15,7 @@ from wholearm_jax.execution.executions import (
 from wholearm_jax.execution.mujoco_model import CONVEX, ContactCompliance, build_mujoco_model
 from wholearm_jax.execution.trials import (
     Amounts,
+    OwnEnd,
     PerturbedRun,
     TrialsResult,
     require_objects,
@@ -24,10 +26,13 @@ from wholearm_jax.execution.trials import (
 
 __all__ = [
     "CONVEX",
+    "IDEAL",
     "Amounts",
     "ContactCompliance",
     "Execution",
     "ExecutionOutcome",
+    "Hardware",
+    "OwnEnd",
     "PerturbedRun",
     "Tolerance",
     "TrialsResult",
@@ -36,6 +41,7 @@ __all__ = [
     "execute",
     "motor_torques",
     "require_objects",
+    "require_same_plan",
     "require_wires",
     "rollout_in_parallel",
     "run_trials",

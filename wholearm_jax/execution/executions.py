@@ -1,5 +1,5 @@
-r"""Execute: a torque schedule driven open loop through `build_mujoco_model`, and what became of it against the
-prediction.
+r"""Execute: a torque schedule driven open loop, or a controller, through `build_mujoco_model`, and what became
+of it against the prediction.
 
 The object is placed at the projected start of the plan's first path, at rest, every gap 0; nothing settles before the
 torque begins. Each step holds the torque of its middle. The plan succeeded if at its end the object stands where the
@@ -23,8 +23,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from wholearm_jax.core import Status, require_positive
+from wholearm_jax.execution.closed_loop import (
+    ControlledMotor,
+    Hardware,
+    closed_loop_step,
+    require_hardware,
+    require_same_plan,
+)
 from wholearm_jax.execution.coulomb_friction import advance
 from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
+from wholearm_jax.feedback import Controller
 from wholearm_jax.model import (
     Arrival,
     ContactFormation,
@@ -42,6 +50,9 @@ from wholearm_jax.phases import Result, target_configuration, trajectory
 
 TOUCH = 1e-3  # gap below which a contact counts as touching [object radii]
 SAMPLES = 2001  # of the prediction, a phase
+
+Motor = Callable[[int, Float[np.ndarray, "2"]], Float[np.ndarray, "2"] | None]
+"""The torque of a time step from its number and the joint angles before it; None at the end."""
 
 
 class Tolerance(NamedTuple):
@@ -145,20 +156,27 @@ def execute(
     timestep: float = 2e-4,
     softness: ContactCompliance = ContactCompliance(),
     tolerance: Tolerance = Tolerance(),
+    controller: Controller | None = None,
+    hardware: Hardware = Hardware(),
+    seed: int = 0,
 ) -> Execution:
-    """Drive the free bodies by a predicted plan's torque schedule, from its start to its end.
+    """Drive the free bodies by a predicted plan's torque schedule or a controller, from its start to its end.
 
     The prediction may fail, but its paths must be known: raises ValueError where one could not be traced, and for a
-    `timestep` that is not positive.
+    `timestep` that is not positive. A controller measures and acts through `hardware`, whose noise `seed` draws.
     """
     require_positive(timestep=timestep)
     scene = prediction.scene
     require_wires(prediction)
     times, step = clock(scene, timestep)
+    torques: Float[np.ndarray, "steps 2"] | Motor = motor_torques(prediction.torque, times, step)
+    if controller is not None:
+        require_hardware(hardware)
+        require_same_plan(controller, scene)
+        step = closed_loop_step(hardware, timestep)
+        torques = ControlledMotor(controller, hardware, step, seed)
     bodies = build_mujoco_model(scene, step, softness)
-    course, creep, met = run_schedule(
-        bodies, scene, start_of(prediction), motor_torques(prediction.torque, times, step), step
-    )
+    course, creep, met = run_schedule(bodies, scene, start_of(prediction), torques, step)
     expected, target = _expected(prediction, bodies.names), target_of(prediction)
     unexpected = {} if meets_obstacle(prediction) else met
     ending, lost = assess_execution(scene, course.z[-1], target, tolerance, creep, unexpected)
@@ -239,26 +257,36 @@ def run_schedule(
     )
 
 
-def rollout(bodies: MujocoModel, start, torques):
+def rollout(bodies: MujocoModel, start, torques: Float[np.ndarray, "steps 2"] | Motor):
     """Step the model from rest at `start`: `z`, `z_dot` and forces `(c_n, c_t)`; row `k` is the state before step `k`.
+
+    `torques` are those of each step, or what says them while the bodies move.
 
     Then how far contacts slipped against Coulomb's law in all steps together, at most [m], infinite where MuJoCo gave
     up; and what links met, or which range ended, when first [s].
     """
     data, step = mujoco.MjData(bodies.model), stepper(bodies)
-    count, pairs = len(torques), len(bodies.names)
-    z, z_dot, forces = np.empty((count + 1, 5)), np.empty((count + 1, 5)), np.empty((count + 1, pairs, 2))
+    motor = torques if callable(torques) else _scheduled_motor(torques)
+    z, z_dot, forces = [], [], []
     data.qpos[:] = start
-    found, creep, met = np.zeros((pairs, 2)), 0.0, {}
-    for k, torque in enumerate(torques):
-        z[k], z_dot[k] = data.qpos, data.qvel
+    found, creep, met, last = np.zeros((len(bodies.names), 2)), 0.0, {}, np.zeros(2)
+    while (torque := motor(len(z), data.qpos[3:])) is not None:
+        z.append(data.qpos.copy())
+        z_dot.append(data.qvel.copy())
         found, wrong = step(bodies, data, torque, found)
-        forces[k], creep = found, creep + wrong * bodies.model.opt.timestep
-        _record_meetings(bodies, data, k * bodies.model.opt.timestep, met)
-    z[count], z_dot[count] = data.qpos, data.qvel
-    forces[count], _ = step(bodies, data, torques[-1], found)  # beyond the end, for the forces there
+        forces.append(found)
+        last, creep = torque, creep + wrong * bodies.model.opt.timestep
+        _record_meetings(bodies, data, (len(z) - 1) * bodies.model.opt.timestep, met)
+    z.append(data.qpos.copy())
+    z_dot.append(data.qvel.copy())
+    forces.append(step(bodies, data, last, found)[0])  # beyond the end, for the forces there
     gave_up = any(warning.number for warning in data.warning)
-    return z, z_dot, forces, np.inf if gave_up else creep, met
+    return np.array(z), np.array(z_dot), np.array(forces), np.inf if gave_up else creep, met
+
+
+def _scheduled_motor(torques: Float[np.ndarray, "steps 2"]) -> Motor:
+    """Return the motor that follows torques known beforehand."""
+    return lambda k, angles: torques[k] if k < len(torques) else None
 
 
 def _record_meetings(bodies: MujocoModel, data: mujoco.MjData, time: float, met: dict[str, float]) -> None:

@@ -13,6 +13,7 @@ against the end of the perturbed object's own path from where it was laid.
 # MuJoCo's names come from a compiled module, which type checkers cannot see into.
 # pyright: reportAttributeAccessIssue=false
 
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -27,6 +28,13 @@ from joblib import Parallel, delayed
 
 from wholearm_jax.core import Status, require_positive, unstack_trees
 from wholearm_jax.ensembles import make_ensemble, wilson_interval
+from wholearm_jax.execution.closed_loop import (
+    ControlledMotor,
+    Hardware,
+    closed_loop_step,
+    require_hardware,
+    require_same_plan,
+)
 from wholearm_jax.execution.executions import (
     ExecutionOutcome,
     Tolerance,
@@ -40,6 +48,7 @@ from wholearm_jax.execution.executions import (
     target_of,
 )
 from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
+from wholearm_jax.feedback import Controller
 from wholearm_jax.model import (
     Arrival,
     ContactFormation,
@@ -91,6 +100,12 @@ class TrialsResult:
 
     @property
     def successes(self) -> int:
+        """How many succeed; against each object's own path end where that is known."""
+        return sum((run.own or run).ending is ExecutionOutcome.OK for run in self.runs)
+
+    @property
+    def nominal_successes(self) -> int:
+        """How many succeed against the unperturbed object's end."""
         return sum(run.ending is ExecutionOutcome.OK for run in self.runs)
 
     @property
@@ -123,11 +138,13 @@ def run_trials(
     tolerance: Tolerance = Tolerance(),
     workers: int | None = None,
     callback: Callable[[PerturbedRun], None] | None = None,
+    controller: Controller | None = None,
+    hardware: Hardware = Hardware(),
 ) -> TrialsResult:
     """Execute `count` perturbed copies of a plan in `workers` processes (default: one for each processor).
 
-    `callback` sees each as it is done, in their order. Raises ValueError as `require_wires` and `require_objects` do,
-    and for numbers that are not positive.
+    `callback` sees each as it is done, in their order. A `controller` measures and acts through `hardware`. Raises
+    ValueError as `require_wires` and `require_objects` do, and for numbers that are not positive.
     """
     require_positive(count=count, timestep=timestep)
     require_wires(prediction)
@@ -135,14 +152,19 @@ def run_trials(
     scenes = _draw_scenes(prediction.scene, amounts, seed, count)
     displacements = _draw_displacements(prediction.scene, amounts, seed, count)
     begins, step = clock(prediction.scene, timestep)
-    torques = motor_torques(prediction.torque, begins, step)
+    drives: Iterator = itertools.repeat(motor_torques(prediction.torque, begins, step))
+    if controller is not None:
+        require_hardware(hardware)
+        require_same_plan(controller, prediction.scene)
+        step = closed_loop_step(hardware, timestep)
+        drives = (ControlledMotor(controller, hardware, step, seed + k) for k in itertools.count())
     nominal, target = start_of(prediction), target_of(prediction)
     laid = [
         lay_in_hand(prediction, scene, start_near(scene, nominal, shift))
         for scene, shift in zip(scenes, displacements, strict=True)
     ]
     copies = ((build_mujoco_model(scene, step, softness), path.start) for scene, path in zip(scenes, laid, strict=True))
-    found = rollout_in_parallel(copies, torques, min(workers or os.cpu_count() or 1, count))
+    found = rollout_in_parallel(copies, drives, min(workers or os.cpu_count() or 1, count))
     runs = []
     expected = meets_obstacle(prediction)
     for scene, own, (end, creep, met) in zip(scenes, laid, found, strict=True):
@@ -220,11 +242,11 @@ def lay_in_hand(prediction: Result, scene: Scene, start) -> OwnPath:
 
 
 def rollout_in_parallel(
-    copies: Iterable[tuple[MujocoModel, Float[np.ndarray, "5"]]], torques, workers: int
+    copies: Iterable[tuple[MujocoModel, Float[np.ndarray, "5"]]], drives: Iterable, workers: int
 ) -> Iterator[tuple[Float[np.ndarray, "5"], float, dict[str, float]]]:
     """Where free bodies end, driven from rest at their starts, how far contacts crept, and what links met
-    (`execution.trace_phase_path`)."""
-    each = (delayed(_end)(bodies, start, torques) for bodies, start in copies)
+    (`execution.trace_phase_path`). `drives` are the torques of each, or its motor."""
+    each = (delayed(_end)(*copy, drive) for copy, drive in zip(copies, drives, strict=False))
     return Parallel(n_jobs=workers, return_as="generator")(each)  # pyright: ignore[reportReturnType]
 
 

@@ -1,5 +1,6 @@
 """TOML scenes, CSV and JSON results, NPZ polygons, and the Zarr store of checks."""
 
+from wholearm_jax.files.controller_json import controller_to_dict, read_controller, write_controller
 from wholearm_jax.files.execution_results import execution_summary, write_execution
 from wholearm_jax.files.file_set import EXECUTION_FILES, RESULT_FILES, FileSet, is_ok, replace_files
 from wholearm_jax.files.polygons_npz import count_polygons, read_polygons
@@ -22,6 +23,7 @@ __all__ = [
     "FileSet",
     "Positive",
     "bundled",
+    "controller_to_dict",
     "count_polygons",
     "execution_summary",
     "explain_validation_error",
@@ -31,12 +33,14 @@ __all__ = [
     "load_start",
     "null_for_undefined",
     "parse",
+    "read_controller",
     "read_polygons",
     "read_torque",
     "replace_files",
     "save",
     "summary",
     "to_dict",
+    "write_controller",
     "write_execution",
     "write_summary",
     "write_torque",

@@ -23,7 +23,9 @@ class FileSet(NamedTuple):
         return *self.others, *(f"{name}.{kind}" for name in self.figures for kind in ("png", "svg", "pdf"))
 
 
-RESULT_FILES = FileSet("summary.json", ("torque.csv", "trajectory.csv", "report.html"), ("plan", "result"))
+RESULT_FILES = FileSet(
+    "summary.json", ("torque.csv", "trajectory.csv", "controller.json", "report.html"), ("plan", "result")
+)
 EXECUTION_FILES = FileSet("execution.json", ("execution.csv", "execution.gif", "model.xml"), ("execution", "frames"))
 
 

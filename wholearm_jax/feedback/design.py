@@ -1,0 +1,185 @@
+"""Design a controller: the curve of joint angles of each path, a reference along it, its torques, and the gains."""
+
+import itertools
+
+import equinox as eqx
+import numpy as np
+
+from wholearm_jax.core import Status, require_positive
+from wholearm_jax.feedback.controller import Controller, PhaseLaw
+from wholearm_jax.feedback.path_table import PathTable, PathTerms, path_terms, tabulate_path
+from wholearm_jax.feedback.reference_motion import (
+    PASSING,
+    ReferenceMotion,
+    passing_motion,
+    scheduled_motion,
+    smooth_motions,
+)
+from wholearm_jax.feedback.stop_torque import choose_push
+from wholearm_jax.feedback.torque_choice import TorqueChoice, choose_torques
+from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, contact_formation
+from wholearm_jax.phases import TracedPhase, describe_end, simulate, trace, trajectory
+from wholearm_jax.tracing import PathEnd
+
+RESERVE = 0.9  # fraction of the torque limits that the reference's torques and their corrections stay within
+PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
+BEYOND = 0.06  # how far the reference goes on beyond the path's end, to meet the contact that ends it [rad]
+APPROACH = 0.15  # speed with which [rad/s]
+FELT = (0.05, 0.03)  # speed [rad/s] below which an object stands, and for how long [s]
+PATIENCE = 1.0  # longest time beyond a phase's duration [s]
+
+
+def feedback(
+    scene: Scene,
+    schedule: TorqueSchedule,
+    *,
+    friction: float = 0.2,
+    mass: float = 0.0,
+    stiffness: float = 60.0,
+    integral: float = 10.0,
+    observer: float = 200.0,
+    own_motion: bool = False,
+) -> Controller:
+    """Design a closed-loop law for a plan (`docs/feedback.md`).
+
+    Torques and gains are chosen for the largest least force over the scene and those whose friction, link by link, and
+    mass are at the ends of their ranges. Each phase's `margin` says how large it is; where it is negative, some
+    object of the set cannot be held by this law.
+
+    Args:
+        scene: Scene with its plan.
+        schedule: Torque schedule that covers the plan; it gives the motion, or the speeds ratios where phases follow
+            one another without a stop.
+        friction: Half width of each link's friction, relative.
+        mass: Half width of the mass, relative.
+        stiffness: Natural frequency `w` of the loop [1/s].
+        integral: Rate of its integral part [1/s].
+        observer: Rate of the filter for place and speed [1/s].
+        own_motion: Follow the schedule's own motion, instead of the smooth one with the largest margin.
+
+    Returns:
+        The controller.
+
+    Raises:
+        ValueError: For numbers that are out of range, for a plan whose paths cannot be traced, and where both joints
+            stand still on a path.
+    """
+    require_positive(stiffness=stiffness, integral=integral, observer=observer)
+    if not (0 <= friction < 1 and 0 <= mass < 1):
+        raise ValueError("friction, mass: shares of at least 0 and less than 1")
+    if any(phase.arrive is Arrival.HOLD for phase in scene.phases):
+        raise ValueError("feedback: knows no phases that only hold the object")
+    result = simulate(scene, schedule)
+    for phase in result.phases:
+        if int(phase.traced.dynamics.status) != Status.OK:
+            raise ValueError(phase.message)
+    scenes = corner_scenes(scene, friction, mass)
+    traces = [tuple(phase.traced for phase in result.phases), *(trace(other) for other in scenes[1:])]
+    tables = [tabulate_path(path.dynamics) for path in traces[0]]
+    terms = [[path_terms(paths[k].dynamics, table) for paths in traces] for k, table in enumerate(tables)]
+    limit = RESERVE * np.asarray(scene.hand.torque_limit)
+    laws = []
+    for group in _groups(scene):
+        options = _motions(scene, group, tables, trajectory(result), own_motion)
+        choices = [[_choose(terms[k], tables[k], limit, m) for k, m in zip(group, o, strict=True)] for o in options]
+        best = int(np.argmax([min(float(c.margin.min()) for c in row) for row in choices]))
+        for k, motion, choice in zip(group, options[best], choices[best], strict=True):
+            laws.append(_phase_law(scenes, scene.phases[k], tables[k], terms[k], motion, choice, traces[0][k]))
+    return Controller(
+        title=scene.title,
+        phases=tuple(laws),
+        stiffness=stiffness,
+        integral=integral,
+        observer=observer,
+        push=PUSH * float(np.max(scene.hand.torque_limit)),
+        felt=FELT,
+        patience=PATIENCE,
+        torque_limit=np.asarray(scene.hand.torque_limit),
+    )
+
+
+def _groups(scene: Scene) -> list[list[int]]:
+    """Phases that follow one another without a stop."""
+    groups = [[0]]
+    for k, phase in enumerate(scene.phases[:-1]):
+        if phase.arrive is Arrival.MOVING:
+            groups[-1].append(k + 1)
+        else:
+            groups.append([k + 1])
+    return groups
+
+
+def _motions(scene: Scene, group, tables, courses, own_motion: bool) -> list[list[ReferenceMotion]]:
+    """Motions to choose from, one a phase of the group in each."""
+    if own_motion:
+        return [[scheduled_motion(tables[k], courses[k]) for k in group]]
+    durations = [float(scene.phases[k].duration) for k in group]
+    lengths = [tables[k].s[-1] for k in group]
+    if len(group) == 1:
+        return [[motion] for motion in smooth_motions(tables[group[0]], durations[0])]
+    speed = [np.hypot(*np.asarray(courses[k].z_dot)[[0, -1], 3:].T) for k in group]
+    ratios = [after[0] / before[1] for before, after in itertools.pairwise(speed)]  # of the impacts
+    options = []
+    for share in PASSING:
+        exits = [share * length / time for length, time in zip(lengths[:-1], durations, strict=False)]
+        entries = [0.0, *(ratio * v for ratio, v in zip(ratios, exits, strict=True))]
+        options.append([passing_motion(*each) for each in zip(lengths, durations, entries, [*exits, 0.0], strict=True)])
+    return options
+
+
+def _choose(every: list[PathTerms], table: PathTable, limit, motion: ReferenceMotion) -> TorqueChoice:
+    """Choose torques and gains at the nodes next to a motion's places."""
+    nodes = np.abs(motion.s[:, None] - table.s).argmin(1)
+    at = [PathTerms(terms.acceleration[nodes], terms.slack[nodes]) for terms in every]
+    return choose_torques(at, limit, motion.v, motion.a)
+
+
+def corner_scenes(scene: Scene, friction: float, mass: float) -> list[Scene]:
+    """Return the scene, and those with the friction of each link and the mass at ends of their ranges.
+
+    Of the sixteen corners these are the eight in which an even number of quantities is low.
+    """
+    if friction == 0 and mass == 0:
+        return [scene]
+    corners = []
+    for signs in itertools.product((-1.0, 1.0), repeat=3):
+        lighter = eqx.tree_at(lambda s: s.object.mass, scene, scene.object.mass * (1 + mass * np.prod(signs)))
+        slip = scene.object.friction * (1 + friction * np.array(signs))
+        corners.append(eqx.tree_at(lambda s: s.object.friction, lighter, slip))
+    return [scene, *corners]
+
+
+def _phase_law(
+    scenes: list[Scene],
+    phase: Phase,
+    table: PathTable,
+    every: list[PathTerms],
+    motion: ReferenceMotion,
+    choice: TorqueChoice,
+    traced: TracedPhase,
+) -> PhaseLaw:
+    """Put the law of one phase together."""
+    gain = np.stack([np.interp(table.s, motion.s, choice.gain[:, j]) for j in range(2)], axis=1)
+    gain /= (gain * every[0].acceleration[:, 3:]).sum(1, keepdims=True)
+    made = int(traced.path.end_reason) == PathEnd.CONTACT_MADE and phase.arrive is not Arrival.MOVING
+    press = 0.0
+    if made:
+        closed = contact_formation((*phase.formation.names, describe_end(scenes[0], phase, traced).split()[0]))
+        press = choose_push(scenes, closed, np.asarray(traced.end), every, choice.torque[-1], gain[-1])
+    return PhaseLaw(
+        name=phase.name,
+        contacts=phase.formation.names,
+        flows=phase.arrive is Arrival.MOVING,
+        s=table.s,
+        theta=table.theta,
+        tangent=table.tangent,
+        gain=gain,
+        time=motion.time,
+        s_ref=motion.s,
+        v_ref=motion.v,
+        torque=choice.torque,
+        reach=BEYOND if made else 0.0,
+        approach=APPROACH,
+        press=press,
+        margin=float(choice.margin.min()),
+    )

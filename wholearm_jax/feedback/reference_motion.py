@@ -1,0 +1,58 @@
+"""The motion that a law follows: smooth from rest to rest, or that of a schedule."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from wholearm_jax.feedback.path_table import PathTable
+from wholearm_jax.phases import Trajectory
+
+TIMES = 101  # of a reference
+PROFILES = ((2, 2), (1, 1))  # exponents p, q of the speed u^p (1 - u)^q from rest to rest
+PASSING = (0.25, 0.5, 1.0)  # speeds at changes of formation, over the mean speed of the phase before
+
+
+class ReferenceMotion(NamedTuple):
+    """Place [rad], speed [rad/s] and acceleration [rad/s^2] over the time since the phase began [s]."""
+
+    time: Float[np.ndarray, "times"]
+    s: Float[np.ndarray, "times"]
+    v: Float[np.ndarray, "times"]
+    a: Float[np.ndarray, "times"]
+
+
+def smooth_motions(table: PathTable, duration: float) -> list[ReferenceMotion]:
+    """Return motions from rest to rest with the speeds of `PROFILES`."""
+    u = np.linspace(0.0, 1.0, TIMES)
+    return [_profile_motion(u, p, q, table.s[-1], duration) for p, q in PROFILES]
+
+
+def _profile_motion(u, p: int, q: int, length: float, duration: float) -> ReferenceMotion:
+    speed = np.polynomial.Polynomial([0.0] * p + [1.0]) * np.polynomial.Polynomial([1.0, -1.0]) ** q
+    place = speed.integ()
+    unit = length / place(1.0)
+    acceleration = unit * speed.deriv()(u) / duration**2
+    acceleration[-1] = 0.0  # what stands is not braked any more
+    return ReferenceMotion(u * duration, unit * place(u), unit * speed(u) / duration, acceleration)
+
+
+def passing_motion(length: float, duration: float, entry: float, exit_: float) -> ReferenceMotion:
+    """Return the cubic motion over a path's `length` [rad] with given speeds [rad/s] at both ends."""
+    u = np.linspace(0.0, 1.0, TIMES)
+    entry, exit_ = (min(v * duration, 2.9 * length) for v in (entry, exit_))  # so that it never goes back
+    cubic = np.polynomial.Polynomial([0.0, entry, 3 * length - 2 * entry - exit_, entry + exit_ - 2 * length])
+    acceleration = cubic.deriv(2)(u) / duration**2
+    acceleration[-1] *= exit_ > 0
+    return ReferenceMotion(u * duration, cubic(u), cubic.deriv()(u) / duration, acceleration)
+
+
+def scheduled_motion(table: PathTable, course: Trajectory) -> ReferenceMotion:
+    """Return the motion of a simulated phase."""
+    rows = np.linspace(0, len(course.time) - 1, TIMES).round().astype(int)
+    time = np.asarray(course.time)[rows] - float(course.time[0])
+    place = np.interp(np.asarray(course.s)[rows], table.parameter, table.s)
+    speed = np.hypot(*np.asarray(course.z_dot)[rows, 3:].T)
+    acceleration = np.gradient(speed, time, edge_order=2)
+    acceleration[-1] *= speed[-1] > 0
+    return ReferenceMotion(time, place, speed, acceleration)
