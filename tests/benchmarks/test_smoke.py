@@ -14,6 +14,7 @@ RUNS = {  # what each runs, after `import NAME as module`
     "cold_start": "run('--quick')",
     "collocation": "run('heptagon', '--knots', '8')",
     "execution": "module.SCENES, module.STEPS = ('heptagon',), (1.6e-3, 8e-4); run('--quick')",
+    "feedback": "module.SETS = dict([*module.SETS.items()][:1]); run('--quick', '--scenes', 'heptagon')",
     "flying_plans": "run('--count', '1', '--phases', '2')",
     "gradients": "module.KNOTS, module.TOLERANCES = (4,), (1e-4,); run('--quick')",
     "interruption": "run('--runs', '1', '--latest', '3')",

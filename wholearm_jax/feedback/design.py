@@ -160,12 +160,13 @@ def _phase_law(
 ) -> PhaseLaw:
     """Put the law of one phase together."""
     gain = np.stack([np.interp(table.s, motion.s, choice.gain[:, j]) for j in range(2)], axis=1)
-    gain /= (gain * every[0].acceleration[:, 3:]).sum(1, keepdims=True)
     made = int(traced.path.end_reason) == PathEnd.CONTACT_MADE and phase.arrive is not Arrival.MOVING
     press = 0.0
     if made:
         closed = contact_formation((*phase.formation.names, describe_end(scenes[0], phase, traced).split()[0]))
-        press = choose_push(scenes, closed, np.asarray(traced.end), every, choice.torque[-1], gain[-1])
+        press, gain_at_stop = choose_push(scenes, closed, np.asarray(traced.end), every, choice.torque[-1])
+        gain[table.s > table.s[-1] - BEYOND] = gain_at_stop
+    gain /= (gain * every[0].acceleration[:, 3:]).sum(1, keepdims=True)
     return PhaseLaw(
         name=phase.name,
         contacts=phase.formation.names,

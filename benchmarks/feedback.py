@@ -1,0 +1,86 @@
+"""Open loop beside closed loop: how many executions of perturbed objects succeed, on the bundled plans.
+
+    python benchmarks/feedback.py [--count 20] [--scenes heptagon hexagon] [--quick]
+
+Two sets: friction of each link within 20 %, and that together with mass within 10 %, vertices within 0.5 mm and the
+start within 1 mm. Both loops see the same objects; success is within 0.5 mm and 0.01 rad of each object's own path
+end, the last contacts closed. The closed loop samples at 1 kHz, 1 ms late, with encoders of 4096
+counts and 1 % of torque noise.
+"""
+
+import argparse
+import time
+
+import matplotlib.pyplot as plt
+import numpy as np
+from measure import RESULTS, save
+
+import wholearm_jax as wa
+from wholearm_jax.execution import Amounts, Hardware, run_trials
+from wholearm_jax.plotting import LINK_COLOURS as COLOURS
+
+SCENES = ("heptagon", "hexagon", "tipping", "flight", "passage")
+SETS = {
+    "friction": Amounts(friction=0.2),
+    "friction, mass, vertices, start": Amounts(friction=0.2, mass=0.1, geometry=5e-4, start=1e-3),
+}
+MASS = 0.1  # half width of the mass that laws are designed for
+
+
+def measure_one(name: str, count: int) -> dict:
+    """Both loops on one plan."""
+    scene = wa.load(name)
+    optimum = wa.optimise(scene)
+    begun = time.perf_counter()
+    controller = wa.feedback(scene, optimum.torque, mass=MASS)
+    found = {"design_seconds": time.perf_counter() - begun, "margins": [phase.margin for phase in controller.phases]}
+    for label, amounts in SETS.items():
+        found[label] = {}
+        for loop, more in (("open", {}), ("closed", {"controller": controller, "hardware": Hardware()})):
+            trials = run_trials(optimum.result, count, amounts, own_ends=True, **more)
+            own = [run.own for run in trials.runs if run.own is not None]
+            found[label][loop] = {
+                "executions": count,
+                "successes": trials.successes,
+                "nominal_successes": trials.nominal_successes,
+                "interval_95": list(trials.interval),
+                "median_position_error": float(np.median([one.position_error for one in own])),
+                "endings": [one.ending.value for one in own],
+            }
+            print(f"{name}, {label}, {loop} loop: {trials.message}", flush=True)
+    return found
+
+
+def draw(found: dict) -> plt.Figure:
+    """Success rates of both loops with their intervals."""
+    figure, axes = plt.subplots(1, len(SETS), figsize=(8.4, 3.2), sharey=True, layout="constrained")
+    for ax, label in zip(axes, SETS, strict=True):
+        for k, loop in enumerate(("open", "closed")):
+            rows = [plan[label][loop] for plan in found.values()]
+            rate = np.array([row["successes"] / row["executions"] for row in rows])
+            low, high = np.array([row["interval_95"] for row in rows]).T
+            at, error = np.arange(len(rows)) + 0.36 * (k - 0.5), np.maximum(np.stack([rate - low, high - rate]), 0)
+            ax.bar(at, 100 * rate, 0.34, yerr=100 * error, color=COLOURS[k], label=f"{loop} loop", capsize=2)
+        ax.set_xticks(range(len(found)), list(found), rotation=20)
+        ax.set_title(label, fontsize=9)
+        ax.spines[["top", "right"]].set_visible(False)
+    axes[0].set_ylabel("executions that succeed [%]")
+    axes[-1].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def main() -> None:
+    wa.configure()
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--count", type=int, default=20, help="executions of each plan, set and loop")
+    parser.add_argument("--scenes", nargs="+", default=SCENES)
+    parser.add_argument("--quick", action="store_true", help="one execution each; nothing is written")
+    options = parser.parse_args()
+    found = {name: measure_one(name, 1 if options.quick else options.count) for name in options.scenes}
+    if not options.quick:
+        save("feedback", found)
+        draw(found).savefig(RESULTS / "feedback.svg", bbox_inches="tight")
+
+
+if __name__ == "__main__":
+    main()

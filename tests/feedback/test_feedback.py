@@ -1,0 +1,119 @@
+"""Closed-loop laws: their design, their file, an independent reading of both, and executions under other friction."""
+
+import json
+
+import equinox as eqx
+import numpy as np
+import pytest
+from reference.feedback_law import Law
+
+import wholearm_jax as wa
+from wholearm_jax.core.errors import BadInput
+from wholearm_jax.execution import Amounts, ExecutionOutcome, Hardware, execute, run_trials
+from wholearm_jax.feedback import begin, step
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return wa.load("heptagon")
+
+
+@pytest.fixture(scope="module")
+def controller(scene):
+    return wa.feedback(scene, wa.quasistatic(scene), friction=0.2)
+
+
+@pytest.fixture(scope="module")
+def path(controller, tmp_path_factory):
+    path = tmp_path_factory.mktemp("controller") / "controller.json"
+    wa.write_controller(controller, path)
+    return path
+
+
+def test_a_reading_of_the_page_and_the_file_gives_the_same_torques(controller, path):
+    """Along measured angles that lag, wander off the path, stand at stops and go beyond them."""
+    rng, law, state = np.random.default_rng(0), Law(path), None
+    phases, worst = set(), 0.0
+    for k in range(2600):
+        t, n = 1e-3 * k, 0 if state is None else state.phase
+        u = t - (0.0 if state is None else state.began)
+        at = np.interp(u - 0.01, controller.phases[n].time, controller.phases[n].s_ref)
+        angles = [np.interp(at, controller.phases[n].s, controller.phases[n].theta[:, j]) for j in range(2)]
+        angles = np.round((np.array(angles) + 2e-3 * rng.standard_normal(2)) * 652) / 652 if k % 400 < 200 else angles
+        if state is None:
+            state = begin(controller, np.asarray(angles))
+        state, torque = step(controller, state, t, np.asarray(angles))
+        worst = max(worst, np.abs(torque - law.torque(t, np.asarray(angles))).max())
+        phases.add(state.phase)
+    assert phases == {0, 1}
+    assert worst < 1e-9
+    assert law.arrived == state.arrived
+
+
+def test_the_file_is_complete(controller, path, tmp_path):
+    wa.write_controller(wa.read_controller(path), tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda c: c.update(version=0), "version"),
+        (lambda c: c.pop("stiffness"), "stiffness: is missing"),
+        (lambda c: c["phases"][1].update(gain=[[0.0, 1.0]]), r"phases\[1\]: gain"),
+        (lambda c: c["phases"][0]["s"].reverse(), r"phases\[0\]: s: "),
+        (lambda c: c.update(push="much"), "push: must be numbers"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_said_in_one_line(path, tmp_path, change, says):
+    content = json.loads(path.read_text())
+    change(content)
+    (tmp_path / "bad.json").write_text(json.dumps(content))
+    with pytest.raises(BadInput, match=f"bad.json.*{says}") as error:
+        wa.read_controller(tmp_path / "bad.json")
+    assert "\n" not in str(error.value)
+
+
+def test_gains_accelerate_by_one_and_places_are_lengths(controller, scene):
+    """`s` is the length of the curve of joint angles, and a torque `g` adds 1 rad/s^2 to its second derivative."""
+    for law, traced in zip(controller.phases, wa.trace(scene), strict=True):
+        assert np.allclose(np.hypot(*np.diff(law.theta, axis=0).T), np.diff(law.s), rtol=0, atol=1e-12)
+        assert np.allclose(np.hypot(*law.tangent.T), 1.0)
+        assert np.allclose(law.theta[-1], np.asarray(traced.end)[3:], atol=1e-6)
+        dynamics, last = traced.dynamics, int(traced.dynamics.count) - 1
+        panel = int(dynamics.first[last] + dynamics.panels[last]) - 1  # at its end, powers of 1 sum up
+        pull = np.asarray(dynamics.acceleration)[panel].sum(0)[3:]
+        rate = np.hypot(*np.asarray(dynamics.velocity)[panel].sum(0)[3:])
+        assert rate * pull @ law.gain[-1] == pytest.approx(1.0, rel=1e-5)
+
+
+def test_friction_that_open_loop_does_not_survive_is_survived(controller, scene):
+    """A fifth more friction on all links: the schedule leaves the object short, the law brings it to its end."""
+    rougher = eqx.tree_at(lambda s: s.object.friction, scene, 1.2 * scene.object.friction)
+    prediction = wa.simulate(rougher, wa.quasistatic(scene))
+    assert execute(prediction).ending is not ExecutionOutcome.OK
+    closed = execute(prediction, controller=controller, hardware=Hardware(), seed=0)
+    assert closed.ending is ExecutionOutcome.OK
+    assert closed.position_error < 1e-4
+
+
+def test_trials_count_against_each_objects_own_end(controller, scene):
+    prediction = wa.simulate(scene, wa.quasistatic(scene))
+    trials = run_trials(prediction, 1, Amounts(friction=0.1, geometry=2e-4), controller=controller, workers=1)
+    (run,) = trials.runs
+    assert run.own is not None
+    assert run.own.ending is ExecutionOutcome.OK
+    assert run.own.position_error != run.position_error
+    assert trials.successes == 1
+
+
+def test_a_controller_of_another_plan_is_refused(controller):
+    other = wa.load("hexagon")
+    with pytest.raises(ValueError, match="another plan"):
+        execute(wa.simulate(other, wa.quasistatic(other)), controller=controller)
+
+
+@pytest.mark.parametrize("wrong", [{"friction": 1.0}, {"stiffness": 0.0}])
+def test_numbers_out_of_range_are_refused(scene, wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        wa.feedback(scene, wa.quasistatic(scene), **wrong)
