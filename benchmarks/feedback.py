@@ -27,7 +27,7 @@ SETS = {
 MASS = 0.1  # half width of the mass that laws are designed for
 
 
-def measure_one(name: str, count: int) -> dict:
+def measure_one(name: str, count: int, workers: int | None) -> dict:
     """Both loops on one plan."""
     scene = wa.load(name)
     optimum = wa.optimise(scene)
@@ -37,7 +37,7 @@ def measure_one(name: str, count: int) -> dict:
     for label, amounts in SETS.items():
         found[label] = {}
         for loop, more in (("open", {}), ("closed", {"controller": controller, "hardware": Hardware()})):
-            trials = run_trials(optimum.result, count, amounts, own_ends=True, **more)
+            trials = run_trials(optimum.result, count, amounts, own_ends=True, workers=workers, **more)
             own = [run.own for run in trials.runs if run.own is not None]
             found[label][loop] = {
                 "executions": count,
@@ -74,9 +74,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--count", type=int, default=20, help="executions of each plan, set and loop")
     parser.add_argument("--scenes", nargs="+", default=SCENES)
+    parser.add_argument("--workers", type=int, help="processes (default: one for each processor)")
     parser.add_argument("--quick", action="store_true", help="one execution each; nothing is written")
     options = parser.parse_args()
-    found = {name: measure_one(name, 1 if options.quick else options.count) for name in options.scenes}
+    count = 1 if options.quick else options.count
+    found = {name: measure_one(name, count, options.workers) for name in options.scenes}
     if not options.quick:
         save("feedback", found)
         draw(found).savefig(RESULTS / "feedback.svg", bbox_inches="tight")
