@@ -16,6 +16,7 @@ import numpy as np
 from measure import RESULTS, save
 
 import wholearm_jax as wa
+from wholearm_jax.ensembles import wilson_interval
 from wholearm_jax.execution import Amounts, Hardware, run_trials
 from wholearm_jax.plotting import LINK_COLOURS as COLOURS
 
@@ -37,15 +38,14 @@ def measure_one(name: str, count: int, workers: int | None) -> dict:
     for label, amounts in SETS.items():
         found[label] = {}
         for loop, more in (("open", {}), ("closed", {"controller": controller, "hardware": Hardware()})):
-            trials = run_trials(optimum.result, count, amounts, own_ends=True, workers=workers, **more)
-            own = [run.own for run in trials.runs if run.own is not None]
+            trials = run_trials(optimum.result, count, amounts, workers=workers, **more)
             found[label][loop] = {
                 "executions": count,
-                "successes": trials.successes,
-                "nominal_successes": trials.nominal_successes,
-                "interval_95": list(trials.interval),
-                "median_position_error": float(np.median([one.position_error for one in own])),
-                "endings": [one.ending.value for one in own],
+                "successes": trials.own_successes,
+                "nominal_successes": trials.successes,
+                "interval_95": list(wilson_interval(trials.own_successes, count)),
+                "median_position_error": float(np.nanmedian([run.own_position_error for run in trials.runs])),
+                "endings": [run.own_ending.value for run in trials.runs],
             }
             print(f"{name}, {label}, {loop} loop: {trials.message}", flush=True)
     return found

@@ -101,10 +101,9 @@ def test_trials_count_against_each_objects_own_end(controller, scene):
     prediction = wa.simulate(scene, wa.quasistatic(scene))
     trials = run_trials(prediction, 1, Amounts(friction=0.1, geometry=2e-4), controller=controller, workers=1)
     (run,) = trials.runs
-    assert run.own is not None
-    assert run.own.ending is ExecutionOutcome.OK
-    assert run.own.position_error != run.position_error
-    assert trials.successes == 1
+    assert run.own_ending is ExecutionOutcome.OK
+    assert run.own_position_error != run.position_error
+    assert trials.own_successes == 1
 
 
 def test_a_controller_of_another_plan_is_refused(controller):

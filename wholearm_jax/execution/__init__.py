@@ -15,7 +15,6 @@ from wholearm_jax.execution.executions import (
 from wholearm_jax.execution.mujoco_model import CONVEX, ContactCompliance, build_mujoco_model
 from wholearm_jax.execution.trials import (
     Amounts,
-    OwnEnd,
     PerturbedRun,
     TrialsResult,
     require_objects,
@@ -32,7 +31,6 @@ __all__ = [
     "Execution",
     "ExecutionOutcome",
     "Hardware",
-    "OwnEnd",
     "PerturbedRun",
     "Tolerance",
     "TrialsResult",

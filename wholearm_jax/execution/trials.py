@@ -88,6 +88,11 @@ class PerturbedRun:
     own_target: Float[np.ndarray, "5"] | None
     own_ending: ExecutionOutcome
 
+    @property
+    def own_position_error(self) -> float:
+        """How far the object is from the end of its own path [m]; NaN where that has none."""
+        return np.nan if self.own_target is None else float(np.hypot(*(self.end - self.own_target)[:2]))
+
 
 @dataclass(frozen=True)
 class TrialsResult:
@@ -100,12 +105,7 @@ class TrialsResult:
 
     @property
     def successes(self) -> int:
-        """How many succeed; against each object's own path end where that is known."""
-        return sum((run.own or run).ending is ExecutionOutcome.OK for run in self.runs)
-
-    @property
-    def nominal_successes(self) -> int:
-        """How many succeed against the unperturbed object's end."""
+        """How many end where the unperturbed plan does."""
         return sum(run.ending is ExecutionOutcome.OK for run in self.runs)
 
     @property
