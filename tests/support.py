@@ -37,17 +37,8 @@ def richardson(function, largest):
     return (16 * once[1] - once[0]) / 15
 
 
-LADDER = (
-    3.2e-3,
-    1.6e-3,
-    8e-4,
-    4e-4,
-    2e-4,
-    1e-4,
-    5e-5,
-    2.5e-5,
-    1.25e-5,
-)  # step sizes: curvature spoils the large ones, rounding the small
+# Step sizes: curvature spoils the large ones, rounding the small.
+LADDER = (3.2e-3, 1.6e-3, 8e-4, 4e-4, 2e-4, 1e-4, 5e-5, 2.5e-5, 1.25e-5)
 
 
 def steadiest_difference(function):
