@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tests.reference.mechanics import Model, dot
+from tests.reference.mechanics import Model, dot, quarter
 
-OK, LOST, STUCK, REVERSED, NOT_REACHED, LEFT, AMBIGUOUS, SINGULAR, NO_CONVERGENCE, MAX_STEPS = range(10)
-MADE, BEYOND, UNTIL = 1, 2, 3  # why a path ends
+OK, LOST, STUCK, REVERSED, NOT_REACHED, LEFT, AMBIGUOUS, SINGULAR, NO_CONVERGENCE, MAX_STEPS, OBSTACLE = range(11)
+MADE, BEYOND, UNTIL, MET = 1, 2, 3, 4  # why a path ends
 
 
 class Limits(NamedTuple):
@@ -24,14 +24,15 @@ class Limits(NamedTuple):
     energy: float
     sign: float
     place: float
+    overlap: float
     gradient: float
 
 
 # Terms smaller than this beside others are rounding: the drag of a joint that stands still has a speed of 1e-17.
 FLOOR = 1e-9
 IDLE = 1e-6  # the same for a whole column, beside what it would be if all moved, or turned, at the rate of `s`
-DOUBLE = Limits(closure=1e-9, tables=1e-7, motion=1e-7, energy=1e-6, sign=1e-6, place=1e-7, gradient=1e-5)
-SINGLE = Limits(closure=1e-4, tables=1e-2, motion=1e-2, energy=1e-2, sign=1e-2, place=1e-3, gradient=1.0)
+DOUBLE = Limits(closure=1e-9, tables=1e-7, motion=1e-7, energy=1e-6, sign=1e-6, place=1e-7, overlap=1e-9, gradient=1e-5)
+SINGLE = Limits(closure=1e-4, tables=1e-2, motion=1e-2, energy=1e-2, sign=1e-2, place=1e-3, overlap=1e-4, gradient=1.0)
 
 VIOLATIONS = (
     "number missing",
@@ -42,6 +43,8 @@ VIOLATIONS = (
     "seam between pieces",
     "contact beyond its feature",
     "link in the object",
+    "links overlap",
+    "ok although links overlap",
     "end without a cause",
     "start not the nearest",
     "start heads the wrong way",
@@ -56,6 +59,7 @@ VIOLATIONS = (
     "end of the motion",
     "refused although touching",
     "refused although in place",
+    "refused although links are apart",
     "singular without a reason",
     "gradient not finite",
     "modes of gradients differ",
@@ -159,6 +163,22 @@ def outside(model: Model, z) -> np.ndarray:
     low, high = model.limits()
     along = model.geometry(z).along
     return np.maximum(np.maximum(low[:, None] - along, along - high[:, None]).max(-1), 0.0)
+
+
+def rests_on_a_link(model: Model, z, tolerance) -> np.ndarray:
+    """Whether a vertex of the object that no contact holds touches the line of a link (scenes)."""
+    away, directions = model._poses(z[:, None])
+    joint, _, offset, side = model._links()
+    points = z[:, None, None, :2] + away
+    found = np.zeros(len(z), bool)
+    number = np.arange(points.shape[2])
+    for link in range(3):
+        normal = side[link] * quarter(directions[..., link, :])
+        gap = dot(normal[:, :, None], points - joint[:, None, None, link]) - offset[:, link, None, None]
+        held = (model.link == link)[:, :, None] & (model.kind == 0)[:, :, None] & (model.feature[:, :, None] == number)
+        free = ~held.any(1) & (number < model.count[:, None])
+        found |= (free & (np.abs(gap[:, 0]) < tolerance)).any(1)
+    return found
 
 
 def end_is_real(model: Model, z, why, contact, until, tolerance) -> np.ndarray:

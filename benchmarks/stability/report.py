@@ -6,8 +6,8 @@ import numpy as np
 
 from benchmarks.measure import RESULTS, save
 from benchmarks.stability.checks import DOUBLE, SINGLE, VIOLATIONS
+from benchmarks.stability.levels import EXCESSES, REASONS, RESIDUALS, STATUSES
 from benchmarks.stability.scenes import FAMILIES
-from benchmarks.stability.sweep import EXCESSES, REASONS, RESIDUALS, STATUSES
 
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#999999"
@@ -33,6 +33,10 @@ def summary(found) -> dict:
         "status": named(found["status"], STATUSES),
         "status_by_family": {
             family: named(found["status"][found["family"] == k], STATUSES) for k, family in enumerate(FAMILIES)
+        },
+        "status_by_hand": {
+            name: named(found["status"][found["layered"] == kind], STATUSES)
+            for name, kind in (("layered", True), ("coplanar", False))
         },
         "reason_of_refusal": named(found["reason"][~traced], REASONS),
         "violations": {name: int((wrong >> bit & 1).sum()) for bit, name in enumerate(VIOLATIONS)},
@@ -117,6 +121,8 @@ def dynamics(result):
         part = result[precision]
         print(f"\n{precision}: {part['scenes']} scenes, {part['traced']} traced, {part['moved']} moved")
         print("  " + ", ".join(f"{n} {name}" for name, n in part["status"].items()))
+        for hand, counts in part["status_by_hand"].items():
+            print(f"  {hand}: " + ", ".join(f"{n} {name}" for name, n in counts.items()))
         print("  refused: " + ", ".join(f"{n} {name}" for name, n in part["reason_of_refusal"].items()))
         found = {name: n for name, n in part["violations"].items() if n}
         print("  violations: " + (", ".join(f"{n} {name}" for name, n in found.items()) or "none"))
