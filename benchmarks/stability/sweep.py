@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.stability import checks
 from benchmarks.stability.gradients import check_gradients
-from benchmarks.stability.levels import DOUBLE, SINGLE, STATUSES, batches, blank, picked, to_device
+from benchmarks.stability.levels import DOUBLE, SINGLE, STATUSES, Precision, batches, blank, picked, to_device
 from benchmarks.stability.motions import simulate
 from benchmarks.stability.programs import tracer
 from benchmarks.stability.refusals import refuse

@@ -83,13 +83,18 @@ def test_bounds_leave_out_only_what_cannot_roll(name, grip):
         assert float(top.value) == pytest.approx(float(every.value), rel=1e-12)
 
 
+@pytest.fixture(scope="module")
+def slide():
+    """The heptagon's slide, whose path and table know no limits of torque."""
+    return wa.trace(layered("heptagon"))[0].dynamics
+
+
 @pytest.mark.parametrize("acceleration", [-3.0, 0.0, 20.0, 300.0])
 @pytest.mark.parametrize("idle", [False, True], ids=["both fingers drive", "the second only presses"])
 @pytest.mark.parametrize("limits", [(1.0, 1.0), (0.4, 1.5)])
-def test_the_best_squeeze_is_within_limits(limits, idle, acceleration):
+def test_the_best_squeeze_is_within_limits(slide, limits, idle, acceleration):
     """Where one finger alone drives the object the motion tells its torque, which may be beyond its limit."""
-    scene = eqx.tree_at(lambda s: s.hand.torque_limit, layered("heptagon"), jnp.asarray(limits))
-    dynamics = wa.trace(scene)[0].dynamics
+    dynamics = eqx.tree_at(lambda t: t.torque_limit, slide, jnp.asarray(limits))
     if idle:
         dynamics = eqx.tree_at(lambda t: t.acceleration, dynamics, dynamics.acceleration.at[..., 4].set(0.0))
     s, speed = dynamics.breakpoints[0] + 0.4 * dynamics.length, 0.5

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import shapely
 from shapely import LineString, Point, Polygon
-from shapely.affinity import translate
 from support import layered
 
 from wholearm_jax.model import link_obstacles, link_overlaps
@@ -14,6 +14,7 @@ from wholearm_jax.model.hand_collisions import LINK_OBSTACLES, LinkMeeting
 from wholearm_jax.model.kinematics import contact_kinematics
 
 COUNT = 400
+depths_of = jax.jit(jax.vmap(link_overlaps))
 
 
 @pytest.fixture(scope="module")
@@ -33,12 +34,12 @@ def hands():
             jnp.zeros(COUNT, bool),
         ),
     )
-    return drawn, jnp.asarray(rng.uniform(-0.4, np.pi + 0.4, (COUNT, 2)))
+    return jax.tree.map(np.asarray, drawn), rng.uniform(-0.4, np.pi + 0.4, (COUNT, 2))
 
 
 def finger_polygon(hand, k, finger, angle) -> Polygon | LineString:
     """The finger's strip in the world."""
-    joint, length, offset, back = (np.asarray(a)[k, finger] for a in (hand.joint, hand.length, hand.offset, hand.back))
+    joint, length, offset, back = (a[k, finger] for a in (hand.joint, hand.length, hand.offset, hand.back))
     along = np.array([np.cos(angle), np.sin(angle)])
     across = (1, -1)[finger] * np.array([-along[1], along[0]])
     tip = joint + length * along
@@ -48,7 +49,7 @@ def finger_polygon(hand, k, finger, angle) -> Polygon | LineString:
 
 def test_depth_is_positive_where_polygons_overlap(hands):
     hand, angles = hands
-    depths = np.asarray(jax.vmap(link_overlaps)(hand, angles))
+    depths = np.asarray(depths_of(hand, angles))
     overlapping = np.zeros(COUNT, bool)
     for k in range(COUNT):
         first, second = (finger_polygon(hand, k, f, float(angles[k, f])) for f in range(2))
@@ -62,16 +63,17 @@ def test_depth_is_positive_where_polygons_overlap(hands):
 def test_a_shift_by_the_depth_separates_two_strips(hands):
     """The depth is the least distance: no shift of less than it, in any of many directions, separates the fingers."""
     hand, angles = hands
-    depths = np.asarray(jax.vmap(link_overlaps)(hand, angles))[:, 0]
+    depths = np.asarray(depths_of(hand, angles))[:, 0]
     checked = 0
     for k in np.flatnonzero(depths > 1e-3)[:40]:
         first, second = (finger_polygon(hand, k, f, float(angles[k, f])) for f in range(2))
         directions = np.linspace(0, 2 * np.pi, 2000, endpoint=False)
+        ways = np.stack([np.cos(directions), np.sin(directions)], axis=1)[:, None]
+        outline = shapely.get_coordinates(first)
+        make = shapely.polygons if isinstance(first, Polygon) else shapely.linestrings
 
-        def apart(distance, first=first, second=second, directions=directions):
-            return any(
-                not translate(first, distance * np.cos(d), distance * np.sin(d)).intersects(second) for d in directions
-            )
+        def apart(distance, second=second, ways=ways, outline=outline, make=make):
+            return not shapely.intersects(make(outline + distance * ways), second).all()
 
         assert apart(1.001 * depths[k])
         assert not apart(0.999 * depths[k])
@@ -79,12 +81,17 @@ def test_a_shift_by_the_depth_separates_two_strips(hands):
     assert checked > 15
 
 
+def measured(hand, z):
+    """The rows of a hand, and each as a contact."""
+    rows = link_obstacles(hand)
+    return rows, contact_kinematics(rows.contacts, z)
+
+
 def test_gaps_are_distances_of_corners(hands):
     """Each row's gap against the distance of the same corner and line by shapely."""
     hand, angles = hands
-    z = jnp.concatenate([jnp.zeros((COUNT, 3)), angles], axis=1)
-    rows = jax.vmap(link_obstacles)(hand)
-    at = jax.vmap(contact_kinematics)(rows.contacts, z)
+    z = np.concatenate([np.zeros((COUNT, 3)), angles], axis=1)
+    rows, at = jax.tree.map(np.asarray, jax.jit(jax.vmap(measured))(hand, z))
     compared = 0
     for k in range(0, COUNT, 7):
         for row, obstacle in enumerate(LINK_OBSTACLES):
@@ -109,6 +116,6 @@ def test_gaps_are_distances_of_corners(hands):
 def test_layered_fingers_pass_each_other(hands):
     hand, angles = hands
     layered = eqx.tree_at(lambda h: h.layered, hand, jnp.ones(COUNT, bool))
-    depths = jax.vmap(link_overlaps)(layered, angles)
+    depths = depths_of(layered, angles)
     assert float(depths[:, 0].max()) == -np.inf
-    np.testing.assert_array_equal(depths[:, 1:], jax.vmap(link_overlaps)(hand, angles)[:, 1:])
+    np.testing.assert_array_equal(depths[:, 1:], depths_of(hand, angles)[:, 1:])

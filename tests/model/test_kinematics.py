@@ -21,13 +21,14 @@ from wholearm_jax.model.mechanics import scaled_mechanics
 from wholearm_jax.model.scene import rigid_body
 
 NEAR = {"rtol": 1e-13, "atol": 1e-13}
+scaled = jax.jit(scaled_mechanics)
 
 
 @pytest.fixture(scope="module", params=["heptagon", "tipping"])
 def mechanics(request):
     """A formation that slides, and one with a contact that rolls; its candidates are all groups of features."""
     scene = layered(request.param)
-    return scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)
+    return scaled(rigid_body(scene.object), scene.hand, scene.gravity, scene.phases[0].formation)
 
 
 def anywhere(seed):
