@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import shapely
 from scipy.optimize import brentq, root
 from support import layered, steadiest_difference
 
@@ -47,8 +48,8 @@ def curve_point(scene, phi, guess):
         at = corners @ turn.T + [x, y]
         normal1 = np.array([-np.sin(theta1), np.cos(theta1)])
         normal2 = -np.array([-np.sin(theta2), np.cos(theta2)])
-        rows = [at[6, 1], normal1 @ (at[1] - hand.joint[0])]
-        return rows + [normal2 @ (at[k] - hand.joint[1]) for k in (3, 4)]
+        rows = [at[6, 1], normal1 @ (at[1] - hand.joint[0]) - hand.offset[0]]
+        return rows + [normal2 @ (at[k] - hand.joint[1]) - hand.offset[1] for k in (3, 4)]
 
     found = root(gaps, np.asarray(guess)[[0, 1, 3, 4]], tol=1e-14)
     assert np.abs(found.fun).max() < 1e-15, found.message
@@ -69,6 +70,31 @@ def test_end_is_where_a_tip_meets_the_other_finger(flip):
         return np.cos(z[4]) * away[1] - np.sin(z[4]) * away[0]
 
     met = brentq(distance, end[2] - 0.05, end[2] + 0.05, xtol=1e-14)
+    np.testing.assert_allclose(end, curve_point(scene, met, end), atol=1e-10)
+
+
+def test_end_is_where_strips_begin_to_overlap(flip):
+    """Bisection of whether Shapely's rectangles intersect, for fingers with a thickness."""
+    scene, _ = flip
+    scene = eqx.tree_at(lambda s: (s.hand.offset, s.hand.back), scene, (jnp.array([0.002, 0.001]), jnp.full(2, 0.003)))
+    (traced,) = wa.trace(scene)
+    assert int(traced.path.end_reason) == PathEnd.OBSTACLE
+    begin, end = np.asarray(traced.begin), np.asarray(traced.end)
+
+    def strip(z, k):
+        along = np.array([np.cos(z[3 + k]), np.sin(z[3 + k])])
+        across = (1, -1)[k] * np.array([-along[1], along[0]])
+        root_, tip = np.asarray(scene.hand.joint)[k], np.asarray(scene.hand.joint)[k] + 0.14 * along
+        front, back = float(scene.hand.offset[k]) * across, -0.003 * across
+        return shapely.Polygon([root_ + front, tip + front, tip + back, root_ + back])
+
+    ahead = end[2] - begin[2]
+    apart, met = end[2] - 0.05 * ahead, end[2] + 0.05 * ahead
+    for _ in range(60):
+        middle = (apart + met) / 2
+        z = curve_point(scene, middle, end)
+        apart, met = (apart, middle) if strip(z, 0).intersects(strip(z, 1)) else (middle, met)
+    assert abs(met - end[2]) < 0.04 * abs(ahead)
     np.testing.assert_allclose(end, curve_point(scene, met, end), atol=1e-10)
 
 
