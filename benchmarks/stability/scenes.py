@@ -126,11 +126,7 @@ def _placed(rng, family, count):
 def _scaled(rng, family, shape, formation, z, exact):
     n = len(z)
     size, mass = log_uniform(rng, 1e-3, 10.0, n), log_uniform(rng, 1e-4, 1e3, n)
-    friction = np.where(rng.random((n, 1)) < 0.5, rng.uniform(0, 1.5, (n, 1)), rng.uniform(0, 1.5, (n, 3)))
-    friction = np.where(rng.random((n, 1)) < 0.5, friction * 0.3, friction)
-    friction[rng.random(n) < 0.1] = 0.0
-    gravity = np.where(rng.random(n) < 0.6, 9.81, log_uniform(rng, 1e-3, 1e3, n)) * (rng.random(n) > 0.08)
-    tilt = np.where(rng.random(n) < 0.6, 0.0, rng.uniform(-np.pi, np.pi, n))
+    friction, gravity, tilt = _surroundings(rng, n)
     fall = np.sqrt(size / np.maximum(gravity, 1e-3))
     duration = fall * log_uniform(rng, 1e-2, 1e3, n)
     uniform = rng.random(n) < 0.8
@@ -188,6 +184,16 @@ def _scaled(rng, family, shape, formation, z, exact):
         noise=_noise(rng, n, kind),
         flush_tolerance=1e-9 * size,
     )
+
+
+def _surroundings(rng, n):
+    """Coefficients of friction, and gravity: its size and how the hand is tilted."""
+    friction = np.where(rng.random((n, 1)) < 0.5, rng.uniform(0, 1.5, (n, 1)), rng.uniform(0, 1.5, (n, 3)))
+    friction = np.where(rng.random((n, 1)) < 0.5, friction * 0.3, friction)
+    friction[rng.random(n) < 0.1] = 0.0
+    gravity = np.where(rng.random(n) < 0.6, 9.81, log_uniform(rng, 1e-3, 1e3, n)) * (rng.random(n) > 0.08)
+    tilt = np.where(rng.random(n) < 0.6, 0.0, rng.uniform(-np.pi, np.pi, n))
+    return friction, gravity, tilt
 
 
 def _moving(rng, shape, formation, z):
