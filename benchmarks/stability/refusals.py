@@ -87,7 +87,7 @@ def wedged(model, paths):
     """Whether friction wedges the object at a node of its path, by the other model."""
     nodes = np.asarray(paths.nodes, float)
     lanes, panels, count, _ = nodes.shape
-    owner = np.repeat(paths.owner, count, axis=1)[:, :, None]
+    owner = np.repeat(paths.segment_of_panel, count, axis=1)[:, :, None]
     signs = [np.take_along_axis(np.asarray(s, float), owner, axis=1) for s in (paths.slip_sign, paths.joint_sign)]
     toward = np.take_along_axis(np.asarray(paths.chart, float), owner, axis=1)
     return checks.wedged(model, nodes.reshape(lanes, panels * count, 5), toward, signs[0])
