@@ -60,7 +60,7 @@ SINGLE = Precision(
 
 
 RESIDUALS = ("closure", "tangent", "columns", "seam", "motion", "constraint", "energy", "gradient")
-EXCESSES = ("sign", "beyond", "depth", "margin_excess", "tension_missed", "overlap")
+EXCESSES = ("sign", "beyond", "depth", "margin_excess", "tension_missed", "overlap", "thickness")
 
 
 def blank(scenes: Scenes):

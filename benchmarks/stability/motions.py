@@ -54,7 +54,8 @@ def check_wire(found, rows, some, model, units, paths, tables, result, limits):
     links, stated = Links.of(some, model.size), some.flush_tolerance / model.size
     thick = (some.offset + some.back).max(1) > 0
     behind = np.where(thick[:, None], behind_in_object(model, links, along["z"]), 0.0).max(1)
-    found["depth"][rows] = np.maximum(depths(model, along["z"]).max(1), behind)
+    found["thickness"][rows] = behind  # against the object a link is its contact edge: counted, no violation
+    found["depth"][rows] = depths(model, along["z"]).max(1)
     found["overlap"][rows] = overlap(links, along["z"]).max(1)
     flag(found, rows, "closure", found["closure"][rows] > limits.closure)
     flag(found, rows, "tangent", found["tangent"][rows] > limits.tables)

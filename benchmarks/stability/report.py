@@ -38,6 +38,9 @@ def summary(found) -> dict:
             name: named(found["status"][found["layered"] == kind], STATUSES)
             for name, kind in (("layered", True), ("coplanar", False))
         },
+        "ok_with_thickness_in_object": int(
+            ((found["status"] == 0) & (found["thickness"] > DOUBLE.overlap)).sum()
+        ),
         "reason_of_refusal": named(found["reason"][~traced], REASONS),
         "violations": {name: int((wrong >> bit & 1).sum()) for bit, name in enumerate(VIOLATIONS)},
         "scenes_with_violations": int((wrong != 0).sum()),
@@ -123,6 +126,7 @@ def dynamics(result):
         print("  " + ", ".join(f"{n} {name}" for name, n in part["status"].items()))
         for hand, counts in part["status_by_hand"].items():
             print(f"  {hand}: " + ", ".join(f"{n} {name}" for name, n in counts.items()))
+        print(f"  ok, thickness in the object: {part['ok_with_thickness_in_object']}")
         print("  refused: " + ", ".join(f"{n} {name}" for name, n in part["reason_of_refusal"].items()))
         found = {name: n for name, n in part["violations"].items() if n}
         print("  violations: " + (", ".join(f"{n} {name}" for name, n in found.items()) or "none"))
