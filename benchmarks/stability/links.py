@@ -95,25 +95,22 @@ def between(links, z):
 
 def below(links, z):
     """How deep a finger whose tip is below the palm's surface is below it, between the palm's ends."""
-    worst = np.zeros(z.shape[:2])
     ends = np.sort(links.joint[..., 0], axis=1)[:, None]
+    worst = np.zeros(z.shape[:2])
     for k, rectangle in enumerate(np.moveaxis(corners(links, z), 2, 0)):
-        axis = links.joint[:, None, k]
+        # The axis, where it is between the palm's ends, and the tip's two corners.
         d = np.stack([np.cos(z[..., 3 + k]), np.sin(z[..., 3 + k])], axis=-1)
-        for start, tip in ((axis, axis + links.length[:, None, k, None] * d), *_tips(rectangle)):
-            start = np.broadcast_to(start, tip.shape)
-            run = np.where(tip[..., 0] == start[..., 0], 1e-300, tip[..., 0] - start[..., 0])
-            shares = np.clip((ends - start[..., :1]) / run[..., None], 0.0, 1.0)
-            heights = start[..., 1:] + shares * (tip - start)[..., 1:]
-            crossed = (np.ptp(shares, axis=-1) > 1e-9) & (tip[..., 1] < 0)
-            worst = np.maximum(worst, np.where(crossed, -heights.min(-1), 0.0))
+        run = links.length[:, None, k, None] * d
+        start = np.broadcast_to(links.joint[:, None, k], run.shape)
+        across = np.where(run[..., 0] == 0, 1e-300, run[..., 0])
+        shares = np.clip((ends - start[..., :1]) / across[..., None], 0.0, 1.0)
+        heights = start[..., 1:] + shares * run[..., 1:]
+        crossed = (np.ptp(shares, axis=-1) > 1e-9) & ((start + run)[..., 1] < 0)
+        worst = np.maximum(worst, np.where(crossed, -heights.min(-1), 0.0))
+        tips = rectangle[..., 1:3, :]
+        beside = (tips[..., 0] > ends[..., :1]) & (tips[..., 0] < ends[..., 1:])
+        worst = np.maximum(worst, np.where(beside, -tips[..., 1], 0.0).max(-1))
     return worst
-
-
-def _tips(rectangle):
-    """The tip's two corners, as segments of hardly any length beside them toward the joint."""
-    for tip, root in ((1, 0), (2, 3)):
-        yield rectangle[..., tip, :] + 1e-6 * (rectangle[..., root, :] - rectangle[..., tip, :]), rectangle[..., tip, :]
 
 
 def beyond(links, z):

@@ -38,9 +38,7 @@ def summary(found) -> dict:
             name: named(found["status"][found["layered"] == kind], STATUSES)
             for name, kind in (("layered", True), ("coplanar", False))
         },
-        "ok_with_thickness_in_object": int(
-            ((found["status"] == 0) & (found["thickness"] > DOUBLE.overlap)).sum()
-        ),
+        "ok_with_thickness_in_object": int(((found["status"] == 0) & (found["thickness"] > DOUBLE.overlap)).sum()),
         "reason_of_refusal": named(found["reason"][~traced], REASONS),
         "violations": {name: int((wrong >> bit & 1).sum()) for bit, name in enumerate(VIOLATIONS)},
         "scenes_with_violations": int((wrong != 0).sum()),
