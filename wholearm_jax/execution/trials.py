@@ -246,7 +246,7 @@ def rollout_in_parallel(
 ) -> Iterator[tuple[Float[np.ndarray, "5"], float, dict[str, float]]]:
     """Where free bodies end, driven from rest at their starts, how far contacts crept, and what links met
     (`execution.trace_phase_path`). `drives` are the torques of each, or its motor."""
-    each = (delayed(_end)(*copy, drive) for copy, drive in zip(copies, drives, strict=False))
+    each = (delayed(_end)(*copy, motor) for copy, motor in zip(copies, drives, strict=False))
     return Parallel(n_jobs=workers, return_as="generator")(each)  # pyright: ignore[reportReturnType]
 
 

@@ -26,7 +26,7 @@ PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
 BEYOND = 0.06  # how far the reference goes on beyond the path's end, to meet the contact that ends it [rad]
 APPROACH = 0.15  # speed with which [rad/s]
 FELT = (0.05, 0.03)  # speed [rad/s] below which an object stands, and for how long [s]
-PATIENCE = 1.0  # longest time beyond a phase's duration [s]
+LONGEST_DELAY = 1.0  # longest time beyond a phase's duration [s]
 
 
 def feedback(
@@ -93,7 +93,7 @@ def feedback(
         observer=observer,
         push=PUSH * float(np.max(scene.hand.torque_limit)),
         felt=FELT,
-        patience=PATIENCE,
+        patience=LONGEST_DELAY,
         torque_limit=np.asarray(scene.hand.torque_limit),
     )
 

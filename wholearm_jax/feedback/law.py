@@ -35,7 +35,7 @@ class LawState(NamedTuple):
 
 def begin(controller: Controller, angles: Float[np.ndarray, "2"], time: float = 0.0) -> LawState:
     """Return the state at the plan's start."""
-    s = project(controller.phases[0], angles, 0.0)
+    s = project_on_path(controller.phases[0], angles, 0.0)
     return LawState(0, time, time, s, 0.0, s, 0.0, 0.0, False, False)
 
 
@@ -68,7 +68,7 @@ def step(
     return state._replace(time=time, i=i, pressed=bool(wanted >= ahead)), torque
 
 
-def project(phase: PhaseLaw, angles, s: float) -> float:
+def project_on_path(phase: PhaseLaw, angles, s: float) -> float:
     """Return the place [rad] on a phase's curve next to measured angles, from a place near it.
 
     Beyond its ends the curve goes on straight.
@@ -102,7 +102,7 @@ def _observe(controller: Controller, state: LawState, time: float, angles) -> La
     h = time - state.time
     r = np.exp(-controller.observer * h)
     predicted = state.s + h * state.v
-    off = project(controller.phases[state.phase], angles, predicted) - predicted
+    off = project_on_path(controller.phases[state.phase], angles, predicted) - predicted
     s, v = predicted + (1 - r**2) * off, state.v + (1 - r) ** 2 * off / h if h > 0 else state.v
     still = state.still + h if abs(v) < controller.felt[0] else 0.0
     return state._replace(s=float(s), v=float(v), still=still)
@@ -119,7 +119,7 @@ def _change_phase(controller: Controller, state: LawState, time: float, angles) 
     if state.phase + 1 == len(controller.phases):
         return state._replace(arrived=True)
     following = controller.phases[state.phase + 1]
-    s = project(following, angles, 0.0)
+    s = project_on_path(following, angles, 0.0)
     turn = float(_along(phase, phase.length, phase.tangent) @ _along(following, 0.0, following.tangent))
     v = state.v * turn if phase.flows else 0.0
     return LawState(state.phase + 1, time, time, s, v, s - float(following.s_ref[0]), 0.0, 0.0, False, False)

@@ -38,11 +38,11 @@ def tabulate_path(dynamics: PathDynamics, nodes: int = NODES) -> PathTable:
         ValueError: Where both joints stand still: their angles do not say where the object is.
     """
     count = int(dynamics.count)
-    breaks = np.asarray(dynamics.breakpoints)[: count + 1]
-    length = np.diff(breaks)
+    breakpoints = np.asarray(dynamics.breakpoints)[: count + 1]
+    length = np.diff(breakpoints)
     each = np.maximum(2, np.round(nodes * length / length.sum()).astype(int))
     inset = 1e-9 * length  # nodes on both sides of a kink stand apart
-    parts = [np.linspace(breaks[k] + inset[k], breaks[k + 1] - inset[k], each[k]) for k in range(count)]
+    parts = [np.linspace(breakpoints[k] + inset[k], breakpoints[k + 1] - inset[k], each[k]) for k in range(count)]
     segment, parameter = np.repeat(np.arange(count), each), np.concatenate(parts)
     z, x = jax.device_get(_geometry(dynamics, jnp.asarray(segment), jnp.asarray(parameter)))
     rate = np.hypot(*x[:, 3:].T)

@@ -9,7 +9,7 @@ from wholearm_jax.feedback.path_table import PathTable
 from wholearm_jax.phases import Trajectory
 
 TIMES = 101  # of a reference
-PROFILES = ((2, 2), (1, 1))  # exponents p, q of the speed u^p (1 - u)^q from rest to rest
+SPEED_EXPONENTS = ((2, 2), (1, 1))  # exponents p, q of the speed u^p (1 - u)^q from rest to rest
 PASSING = (0.25, 0.5, 1.0)  # speeds at changes of formation, over the mean speed of the phase before
 
 
@@ -23,9 +23,9 @@ class ReferenceMotion(NamedTuple):
 
 
 def smooth_motions(table: PathTable, duration: float) -> list[ReferenceMotion]:
-    """Return motions from rest to rest with the speeds of `PROFILES`."""
+    """Return motions from rest to rest with the speeds of `SPEED_EXPONENTS`."""
     u = np.linspace(0.0, 1.0, TIMES)
-    return [_profile_motion(u, p, q, table.s[-1], duration) for p, q in PROFILES]
+    return [_profile_motion(u, p, q, table.s[-1], duration) for p, q in SPEED_EXPONENTS]
 
 
 def _profile_motion(u, p: int, q: int, length: float, duration: float) -> ReferenceMotion:

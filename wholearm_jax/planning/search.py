@@ -30,7 +30,10 @@ from wholearm_jax.planning.successors import touching_contacts
 STOPS = (1 / 3, 2 / 3)  # fractions of a path at which other moves may begin
 MERGE_TOL = 1e-5  # configurations closer than this, in object radii and radians, are one node
 TYPICAL_SHIFT, TYPICAL_TURN = 0.5, 0.5  # of one move [object radii, rad], for the estimate of phases to come
-SEARCH_PATIENCE, LEAST_PATIENCE = 1.0, 20  # nodes without a better plan, over those up to the last one; at least so many
+SEARCH_PATIENCE, LEAST_PATIENCE = (
+    1.0,
+    20,
+)  # nodes without a better plan, over those up to the last one; at least so many
 
 
 @dataclass
