@@ -13,7 +13,17 @@ import wholearm_jax.cli.interruption  # noqa: F401, first: a command may be inte
 from wholearm_jax.core import Status, configure
 from wholearm_jax.ensembles import check
 from wholearm_jax.feedback import Controller, feedback
-from wholearm_jax.files import load, parse, read_controller, read_torque, save, write_controller, write_torque
+from wholearm_jax.files import (
+    load,
+    parse,
+    read_controller,
+    read_outline,
+    read_torque,
+    save,
+    scene_from_outline,
+    write_controller,
+    write_torque,
+)
 from wholearm_jax.model import Scene, TorqueSchedule, torque_schedule
 from wholearm_jax.optimisation import (
     bounds,
@@ -45,8 +55,10 @@ __all__ = [
     "plan",
     "quasistatic",
     "read_controller",
+    "read_outline",
     "read_torque",
     "save",
+    "scene_from_outline",
     "search_by_steps",
     "shortest_motions",
     "simulate",

@@ -1,4 +1,5 @@
-"""The command line: `wholearm optimise`, `simulate`, `search`, `check`, `report`, `formations`, `execute`, `scenes`.
+"""The command line: `wholearm optimise`, `simulate`, `search`, `check`, `report`, `formations`, `execute`,
+`scene`, `scenes`.
 
 Exit status 0 when the result is `ok`, 1 when the plan fails (its status is printed), 2 for bad input, in one line.
 """
@@ -22,6 +23,7 @@ from wholearm_jax.cli.interruption import INTERRUPTED, exit_on_interrupt
 from wholearm_jax.cli.optimise import optimise
 from wholearm_jax.cli.plan import plan
 from wholearm_jax.cli.report import report
+from wholearm_jax.cli.scene import scene
 from wholearm_jax.cli.scenes import scenes
 from wholearm_jax.cli.search import search
 from wholearm_jax.cli.simulate import simulate
@@ -48,7 +50,7 @@ def _options(
     """Dynamics and torque optimisation of planar whole-arm manipulation."""
 
 
-for command in (check, scenes, plan, optimise, simulate, formations, search, tradeoff, report, execute):
+for command in (check, scene, scenes, plan, optimise, simulate, formations, search, tradeoff, report, execute):
     app.command()(command)
 
 

@@ -58,12 +58,16 @@ def load(name: str | Path) -> Scene:
 
 def load_start(name: str | Path) -> Scene:
     """Read a scene as `load` does; its phases may be missing."""
-    data = _read_toml(name)
+    return parse_start(_read_toml(name), str(name))
+
+
+def parse_start(data: dict[str, Any], source: str = "scene") -> Scene:
+    """Build a scene as `parse` does; its phases may be missing."""
     if data.get("phase"):
-        return parse(data, str(name))
+        return parse(data, source)
     contacts = ["palm:v0", "palm:v1", "palm:v2", "finger1:v0"]  # which every polygon has
     placeholder = {"name": "none", "contacts": contacts, "toward": "x-", "duration": 1.0}
-    return eqx.tree_at(lambda s: s.phases, parse(data | {"phase": [placeholder]}, str(name)), ())
+    return eqx.tree_at(lambda s: s.phases, parse(data | {"phase": [placeholder]}, source), ())
 
 
 def load_goal(name: str | Path) -> dict[str, Any] | None:

@@ -1,5 +1,6 @@
 """What a scene is: polygon, hand, contact formation, contact kinematics, scaling, torque schedule."""
 
+from wholearm_jax.model.hand_choice import HandChoice, choose_hand, resting_edges, scaled_hand
 from wholearm_jax.model.hand_collisions import LINK_OBSTACLES, LinkMeeting, link_obstacles, link_overlaps
 from wholearm_jax.model.kinematics import (
     FEATURE_GROUPS,

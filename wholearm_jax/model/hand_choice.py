@@ -1,0 +1,128 @@
+"""A hand to start from: proportions with which both fingers close on an object at rest, with room to move it.
+
+The hand is a scaled copy of one design. Its size follows from the object's: the joints stand close beside it, so that
+the fingers lean on it rather than lie on it, and the fingers reach well over it. Inertia, friction and torque limit of
+the joints are those of the design for the finger's length and the object's weight, so that a larger or heavier part
+asks for the same shares of them.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from wholearm_jax.core import as_device_array
+from wholearm_jax.model.hand_collisions import link_overlaps
+from wholearm_jax.model.resting import resting_angle, resting_configuration
+from wholearm_jax.model.scene import Hand, Polygon, rigid_body
+
+GRAVITY = 9.81  # [m/s^2], of the loads that the joints are made for
+SPAN = (1.3, 1.15, 1.45, 1.6)  # distance of the joints over the object's width at rest, in the order of preference
+REACH = (1.1, 0.85, 0.7, 0.55, 0.4)  # length of the fingers over the sum of the object's width and height at rest
+CLEARANCE = (0.15, 0.02)  # least distance between the fingers at the start, over that sum: wanted, and accepted
+# The design, made dimensionless by the object's mass m, gravity g and the fingers' length L.
+JOINT_INERTIA = 0.6  # m L^2
+JOINT_VISCOSITY = 0.7  # m g L sqrt(L / g)
+JOINT_DRY_FRICTION = 0.04  # m g L
+JOINT_TORQUE_LIMIT = 4.0  # m g L
+_DIGITS = 4  # to which lengths are rounded [m]
+
+
+class HandChoice(NamedTuple):
+    """A hand, and how an object begins in it: at rest on an edge, midway between the joints."""
+
+    hand: Hand
+    edge: int
+    x: float  # of the centre of mass [m]
+    tipping_angle: float  # [rad] by which the object may be turned over either end of the edge before it tips
+    width: float  # of the object at rest [m]
+    height: float
+
+
+def choose_hand(shape: Polygon) -> HandChoice:
+    """Choose a hand for an object, and an edge to begin on.
+
+    Args:
+        shape: the object.
+
+    Raises:
+        ValueError: if the object can rest on none of its edges, or no hand of the design closes on it.
+    """
+    body = rigid_body(shape)
+    corners = np.asarray(body.vertices)[: int(body.count)]
+    edges = resting_edges(corners)
+    if not edges:
+        raise ValueError("the object can lie at rest on none of its edges")
+    for clearance, (edge, tipping_angle) in itertools.product(CLEARANCE, edges):
+        at = _laid_down(corners, edge)
+        width, height = np.ptp(at, axis=0).tolist()
+        x = round(-(at[:, 0].min() + at[:, 0].max()) / 2, _DIGITS) + 0.0
+        for span, reach in itertools.product(SPAN, REACH):
+            hand = scaled_hand(span * width, reach * (width + height), float(body.mass))
+            if _fits(shape, hand, edge, x, clearance * (width + height)):
+                return HandChoice(hand, edge, x, tipping_angle, width, height)
+    raise ValueError("no hand closes on the object on any edge on which it can lie")
+
+
+def resting_edges(corners: Float[np.ndarray, "count 2"]) -> list[tuple[int, float]]:
+    """List the edges on which a polygon lies at rest, the steadiest first.
+
+    Args:
+        corners: vertices about the centre of mass [m].
+
+    Returns:
+        Each edge with the angle [rad] by which the object may be turned over either of its ends before it tips.
+    """
+    steady = []
+    for edge in range(len(corners)):
+        at = _laid_down(corners, edge)
+        height = -at[edge, 1]
+        left, right = -at[edge, 0], at[(edge + 1) % len(corners), 0]
+        if at[:, 1].min() >= -height - 1e-9 * np.ptp(corners) and min(left, right) > 0:
+            steady.append((edge, float(np.arctan2(min(left, right), height))))
+    return sorted(steady, key=lambda row: (-round(row[1], 9), row[0]))
+
+
+def scaled_hand(span: float, length: float, mass: float) -> Hand:
+    """Build the hand of the design with joints `span` apart, for objects of a mass.
+
+    Args:
+        span: distance of the joints [m].
+        length: of the fingers [m].
+        mass: of the object [kg].
+    """
+    half_span, length = round(span / 2, _DIGITS), round(length, _DIGITS)
+    load = mass * GRAVITY * length
+    design = {
+        "inertia": JOINT_INERTIA * mass * length**2,
+        "viscous": JOINT_VISCOSITY * load * np.sqrt(length / GRAVITY),
+        "dry": JOINT_DRY_FRICTION * load,
+        "torque_limit": JOINT_TORQUE_LIMIT * load,
+    }
+    values = {key: as_device_array([float(f"{value:.3g}")] * 2) for key, value in design.items()}
+    return Hand(
+        joint=as_device_array([[half_span, 0.0], [-half_span, 0.0]]),
+        length=as_device_array([length, length]),
+        offset=as_device_array([0.0, 0.0]),
+        back=as_device_array([0.0, 0.0]),
+        range=as_device_array([[0.0, np.pi]] * 2),
+        layered=as_device_array(False),
+        **values,
+    )
+
+
+def _laid_down(corners: np.ndarray, edge: int) -> np.ndarray:
+    """Turn a polygon about its centre of mass so that an edge lies down."""
+    phi = resting_angle(corners, edge)
+    turn = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]])
+    return corners @ turn.T
+
+
+def _fits(shape: Polygon, hand: Hand, edge: int, x: float, clearance: float) -> bool:
+    """Say whether both fingers close on the object on an edge, apart from one another."""
+    try:
+        z = resting_configuration(shape, hand, edge, x)
+    except ValueError:
+        return False
+    return float(link_overlaps(hand, as_device_array(z[3:]))[0]) < -clearance
