@@ -209,12 +209,12 @@ def _nest(source: str, polygons: list[shapely.Polygon], tolerance: float):
 
 def _outline(source: str, outer: shapely.Polygon, holes, tolerance: float, skipped: tuple[str, ...]) -> Outline:
     """Round an outline's vertices, and take its holes from its area."""
-    digits = int(np.ceil(-np.log10(tolerance / _ROUNDING)))
-    rings = [np.round(np.array(orient(p).exterior.coords)[:-1], digits) + 0.0 for p in (outer, *holes)]
+    decimals = int(np.ceil(-np.log10(tolerance / _ROUNDING)))
+    rings = [np.round(np.array(orient(p).exterior.coords)[:-1], decimals) + 0.0 for p in (outer, *holes)]
     defect = find_defect(rings[0][None])
     if defect is not None:
         raise SceneError(f"{source}: {defect[1]}; a smaller tolerance may help")
-    origin = rings[0].mean(0)  # sums about a nearby point keep their digits
+    origin = rings[0].mean(0)  # sums about a nearby point keep their decimals
     moments = zip(*_signed_moments([ring - origin for ring in rings]), strict=True)
     area, first, second = (sum(parts) for parts in moments)
     centroid = first / area

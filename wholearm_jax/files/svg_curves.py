@@ -5,6 +5,7 @@ import math
 import re
 from collections import Counter
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -41,7 +42,7 @@ def read_svg_curves(path: Path, unit: str | None, tolerance: float, units: dict[
             root.attrib.pop(key, None)
     scale = units[unit] if unit else units["in"] / PIXELS_PER_INCH
     try:
-        parsed = svgelements.SVG.parse(io.BytesIO(ElementTree.tostring(root)), reify=True, ppi=PIXELS_PER_INCH)
+        parsed: Any = svgelements.SVG.parse(io.BytesIO(ElementTree.tostring(root)), reify=True, ppi=PIXELS_PER_INCH)
         shapes = [element for element in parsed.elements() if isinstance(element, svgelements.Shape)]
         curves = [abs(svgelements.Path(shape)) for shape in shapes]
     except (ValueError, TypeError, AttributeError, IndexError, ZeroDivisionError) as error:
@@ -52,14 +53,15 @@ def read_svg_curves(path: Path, unit: str | None, tolerance: float, units: dict[
     return DrawnCurves(chains, skipped)
 
 
-def _chains(curve: svgelements.Path, tolerance: float) -> list[np.ndarray]:
+def _chains(curve: Any, tolerance: float) -> list[np.ndarray]:
     """Flatten each part of a path into points of its own."""
     chains: list[list[tuple[float, float]]] = []
     for segment in curve:
-        if isinstance(segment, svgelements.Move):
+        kind = type(segment).__name__
+        if kind == "Move":
             chains.append([(segment.end.x, segment.end.y)])
         elif segment.end is not None and chains:
-            if isinstance(segment, svgelements.Close):
+            if kind == "Close":
                 chains[-1].append(chains[-1][0])
                 chains.append([chains[-1][0]])  # what follows without a move begins where the closed part did
             else:
@@ -69,15 +71,15 @@ def _chains(curve: svgelements.Path, tolerance: float) -> list[np.ndarray]:
     return [np.array(chain) for chain in chains if len(chain) > 1]
 
 
-def _chords(segment, tolerance: float) -> int:
+def _chords(segment: Any, tolerance: float) -> int:
     """Return how many chords, evenly spaced in the parameter, keep within a tolerance of a segment."""
-    if isinstance(segment, svgelements.Arc):
+    kind = type(segment).__name__
+    if kind == "Arc":
         radius = max(abs(segment.rx), abs(segment.ry))
         step = 2 * math.acos(max(1 - tolerance / radius, 0.0)) if radius > 0 else math.pi
         return max(math.ceil(abs(float(segment.sweep)) / step), 1)
-    names = {svgelements.QuadraticBezier: ("start", "control", "end")}
-    names[svgelements.CubicBezier] = ("start", "control1", "control2", "end")
-    keys = names.get(type(segment))
+    curves = {"QuadraticBezier": ("start", "control", "end"), "CubicBezier": ("start", "control1", "control2", "end")}
+    keys = curves.get(kind)
     if keys is None:
         return 1
     controls = np.array([(getattr(segment, key).x, getattr(segment, key).y) for key in keys])

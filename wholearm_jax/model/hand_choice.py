@@ -74,14 +74,14 @@ def resting_edges(corners: Float[np.ndarray, "count 2"]) -> list[tuple[int, floa
     Returns:
         Each edge with the angle [rad] by which the object may be turned over either of its ends before it tips.
     """
-    steady = []
+    rows = []
     for edge in range(len(corners)):
         at = _laid_down(corners, edge)
         height = -at[edge, 1]
         left, right = -at[edge, 0], at[(edge + 1) % len(corners), 0]
         if at[:, 1].min() >= -height - 1e-9 * np.ptp(corners) and min(left, right) > 0:
-            steady.append((edge, float(np.arctan2(min(left, right), height))))
-    return sorted(steady, key=lambda row: (-round(row[1], 9), row[0]))
+            rows.append((edge, float(np.arctan2(min(left, right), height))))
+    return sorted(rows, key=lambda row: (-round(row[1], 9), row[0]))
 
 
 def scaled_hand(span: float, length: float, mass: float) -> Hand:
