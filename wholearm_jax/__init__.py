@@ -34,7 +34,7 @@ from wholearm_jax.optimisation import (
     shortest_motions,
 )
 from wholearm_jax.phases import margin, simulate, trace, trajectory
-from wholearm_jax.planning import plan
+from wholearm_jax.planning import plan, plan_with_hand
 from wholearm_jax.simulation import IntegratorOptions
 
 __all__ = [
@@ -53,6 +53,7 @@ __all__ = [
     "optimise",
     "parse",
     "plan",
+    "plan_with_hand",
     "quasistatic",
     "read_controller",
     "read_outline",

@@ -19,6 +19,10 @@ from wholearm_jax.cli.progress import solver_progress
 from wholearm_jax.cli.tables import Column, print_json, print_table
 
 GOAL_HELP = 'Where the object is to be, such as "x=-0.03,phi=-40 deg" [m, rad]; instead of the scene\'s [goal].'
+HAND_HELP = (
+    "Search for the hand, too: ranges of finger length and of each joint's distance from the middle [m], "
+    'such as "length=0.08:0.20,joint=0.03:0.08".'
+)
 COLUMNS = ("phase", "contacts", "toward", "until")
 NUMBERS = ("from x, y mm", "phi deg", "to x, y mm", "phi deg", "turn deg", "bound N")
 
@@ -33,6 +37,7 @@ def plan(
     phases: Annotated[int, typer.Option(min=1, help="Longest plan.")] = 5,
     time: Annotated[float, typer.Option(min=0.0, help="Seconds after which the search ends with what it has.")] = 60.0,
     rolling: Annotated[bool, typer.Option(help="Whether contacts may roll.")] = True,
+    hand_from: Annotated[str | None, typer.Option(help=HAND_HELP)] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder for plan.toml, further plans, pictures of their poses and the search."),
@@ -54,6 +59,8 @@ def plan(
             def show(nodes: int, distance: float) -> None:
                 progress.update(bar, state=f"{nodes} poses, the nearest about {distance:.1f} moves from the goal")
 
+            if hand_from is not None:
+                loaded = _find_hand(loaded, hand_from, wanted, limits, progress, bar)
             found = find_plans(loaded, **wanted, **limits, callback=show)
     except ValueError as error:
         raise BadInput(f"{scene}: {error}") from None
@@ -72,6 +79,41 @@ def plan(
         raise typer.Exit(1)
     if optimise:
         _optimise(found.plans[0], folder)
+
+
+def _find_hand(scene, text: str, wanted: dict[str, Any], limits: dict[str, Any], progress, bar):
+    """Return the scene with the hand, of those in the ranges, on which the goal's plan has the largest certificate."""
+    from wholearm_jax.planning import plan_with_hand
+
+    def show(hands: int, bound: float) -> None:
+        progress.update(bar, state=f"{hands} hands, the largest bound {bound:.3g} N")
+
+    length, joint = _read_ranges(text)
+    found = plan_with_hand(scene, length=length, joint=joint, callback=show, **wanted, **limits)
+    planned = sum(trial.bound > float("-inf") for trial in found.trials)
+    closing = sum(not math.isnan(trial.bound) for trial in found.trials)
+    tried = f"of {len(found.trials)} hands {closing} close on the object, {planned} have a plan"
+    if found.best is None:
+        note(f"--hand-from {text}: {tried}; the scene's own hand is kept")
+    else:
+        best = f"joints at -+{found.best.joint:.4g} m, fingers {found.best.length:.4g} m long"
+        note(f"--hand-from {text}: {tried}; the best: {best}")
+    return found.scene
+
+
+def _read_ranges(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Read the two ranges of `length=0.08:0.20,joint=0.03:0.08`."""
+    ranges = {}
+    try:
+        for part in text.split(","):
+            name, _, limits = (piece.strip() for piece in part.partition("="))
+            low, high = map(float, limits.split(":"))
+            ranges[name] = low, high
+    except ValueError:
+        ranges = {}
+    if ranges.keys() != {"length", "joint"}:
+        raise BadInput(f"--hand-from {text}: write both ranges [m], such as length=0.08:0.20,joint=0.03:0.08")
+    return ranges["length"], ranges["joint"]
 
 
 def _goal(name: str, own: dict[str, Any] | None, goal, by, tolerance) -> dict[str, Any]:

@@ -55,7 +55,8 @@ def scene(
         print_json({"scene": str(path)} | tables)
         return
     print("\n".join(lines))
-    print(f"-> {path}; go on with: wholearm plan {path} --by x=-0.01")
+    span = 2 * tables["hand"]["finger1"]["joint"][0]
+    print(f"-> {path}; go on with: wholearm plan {path} --by x={-(span - choice.width) / 4:.1g}")
 
 
 def _describe(outline) -> str:

@@ -12,7 +12,7 @@ import shapely
 from jaxtyping import Float
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from wholearm_jax.core import SceneError
 
@@ -96,7 +96,7 @@ def _bridge_gaps(source: str, ends: np.ndarray, node: np.ndarray, tolerance: flo
     if not len(loose):
         return node
     node = node.copy()
-    distance, nearest = cKDTree(ends[loose]).query(ends[loose], k=2)
+    distance, nearest = map(np.asarray, KDTree(ends[loose]).query(ends[loose], k=2))
     # The nearest other end: of two at the same place, either may come first.
     other = np.where(nearest[:, 0] == np.arange(len(loose)), nearest[:, 1], nearest[:, 0])
     for k, end in enumerate(loose):
@@ -110,7 +110,7 @@ def _bridge_gaps(source: str, ends: np.ndarray, node: np.ndarray, tolerance: flo
 
 def _clusters(points: np.ndarray, distance: float) -> np.ndarray:
     """Number the groups of points that lie within a distance of one another."""
-    pairs = cKDTree(points).query_pairs(distance, output_type="ndarray")
+    pairs = KDTree(points).query_pairs(distance, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     return connected_components(graph, directed=False)[1]
 

@@ -168,7 +168,8 @@ def _ring_polygon(source: str, ring: np.ndarray, tolerance: float, unit: float) 
         raise SceneError(f"{source}: the contour at {name_place(ring[0], unit)} has no area")
     if not shapely.LinearRing(ring).is_valid:
         raise SceneError(f"{source}: the contour at {name_place(_crossing(ring), unit)} crosses or touches itself")
-    return shapely.Polygon(ring).simplify(tolerance / 2, preserve_topology=True)
+    simplified = shapely.Polygon(ring).simplify(tolerance / 2, preserve_topology=True)
+    return shapely.Polygon(simplified.exterior)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _crossing(ring: np.ndarray) -> np.ndarray:
@@ -215,8 +216,9 @@ def _outline(source: str, outer: shapely.Polygon, holes, tolerance: float, skipp
     if defect is not None:
         raise SceneError(f"{source}: {defect[1]}; a smaller tolerance may help")
     origin = rings[0].mean(0)  # sums about a nearby point keep their decimals
-    moments = zip(*_signed_moments([ring - origin for ring in rings]), strict=True)
-    area, first, second = (sum(parts) for parts in moments)
+    area, first, second = np.zeros(()), np.zeros(2), np.zeros(())
+    for more in _signed_moments([ring - origin for ring in rings]):
+        area, first, second = area + more[0], first + more[1], second + more[2]
     centroid = first / area
     return Outline(
         source,

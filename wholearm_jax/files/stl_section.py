@@ -2,6 +2,7 @@
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -28,7 +29,7 @@ def read_stl_section(path: Path, unit: str | None, tolerance: float, units: dict
     if unit is None:
         raise SceneError(f"{path}: an STL file does not say its unit; give it, such as --unit mm")
     try:
-        body = trimesh.load(path, file_type="stl", force="mesh")
+        body: Any = trimesh.load(path, file_type="stl", force="mesh")
         low, high = np.asarray(body.bounds)[:, 2]
     except Exception as error:  # whatever a damaged file leads to
         raise SceneError(f"{path}: not an STL file that can be read: {error or type(error).__name__}") from None
@@ -41,7 +42,7 @@ def read_stl_section(path: Path, unit: str | None, tolerance: float, units: dict
     return DrawnCurves([units[unit] * segment for segment in sections[1]])
 
 
-def _cut(body: trimesh.Trimesh, height: float) -> np.ndarray:
+def _cut(body: Any, height: float) -> np.ndarray:
     """Return the segments `(n, 2, 2)` in which a plane across z cuts a body."""
     lines = trimesh.intersections.mesh_plane(body, [0.0, 0.0, 1.0], [0.0, 0.0, height])
     return np.asarray(lines, float).reshape(-1, 2, 3)[:, :, :2]

@@ -50,6 +50,22 @@ def resting_angle(corners: np.ndarray, edge: int) -> float:
     return -float(np.arctan2(along[1], along[0]))
 
 
+def edge_on_palm(shape: Polygon, z: np.ndarray) -> int:
+    """Return the edge of an object that lies on the palm at a configuration `z` (5,) in SI units.
+
+    Raises:
+        ValueError: if none does.
+    """
+    body = rigid_body(shape)
+    corners = np.asarray(body.vertices)[: int(body.count)]
+    heights = z[1] + np.sin(z[2]) * corners[:, 0] + np.cos(z[2]) * corners[:, 1]
+    on_palm = np.abs(heights) <= 1e-6 * np.ptp(corners)
+    edges = np.flatnonzero(on_palm & np.roll(on_palm, -1))
+    if not len(edges):
+        raise ValueError("start: the object does not lie on an edge")
+    return int(edges[0])
+
+
 def _closing_angle(corners: np.ndarray, hand: Hand, finger: int) -> float | None:
     """Return the joint angle at which a finger, closing from outside, first touches; None: it never does."""
     joint, length, offset = (np.asarray(a)[finger] for a in (hand.joint, hand.length, hand.offset))

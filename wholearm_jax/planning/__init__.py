@@ -1,5 +1,6 @@
 """Which contact formation can come next, and which lead to a goal."""
 
+from wholearm_jax.planning.hand_search import HandSearchResult, HandTrial, plan_with_hand
 from wholearm_jax.planning.plans import Plan, PlanningResult
 from wholearm_jax.planning.search import plan
 from wholearm_jax.planning.successors import (
@@ -11,12 +12,15 @@ from wholearm_jax.planning.successors import (
 )
 
 __all__ = [
+    "HandSearchResult",
+    "HandTrial",
     "Plan",
     "PlanningResult",
     "Successor",
     "exit_velocity",
     "flush_sides",
     "plan",
+    "plan_with_hand",
     "successor_formations",
     "touching_contacts",
 ]

@@ -71,6 +71,7 @@ def plan(
     max_phases: int = 5,
     rolling: bool = True,
     time_limit: float = 60.0,
+    max_nodes: int | None = None,
     duration: float = 1.0,
     callback: Callable[[int, float], None] | None = None,
 ) -> PlanningResult:
@@ -86,6 +87,7 @@ def plan(
         max_phases: longest plan.
         rolling: whether contacts may roll.
         time_limit: seconds of search, compiling left out, after which it ends with what it has.
+        max_nodes: configurations to expand at most: unlike time, the same on every machine.
         duration: of each phase [s].
         callback: called with the number of configurations expanded and the distance of the nearest.
 
@@ -111,7 +113,7 @@ def plan(
         rolling=rolling,
     )
     _push(search, start, (), touching)
-    out_of_time = _run(search, time_limit, callback)
+    out_of_time = _run(search, time_limit, max_nodes, callback)
     nearest, reason = None, ""
     if not search.plans:
         steps = search.nearest[1]
@@ -132,7 +134,9 @@ def _start(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
     return z, touching_contacts(scene, as_device_array(z))
 
 
-def _run(search: _Search, time_limit: float, callback: Callable[[int, float], None] | None) -> bool:
+def _run(
+    search: _Search, time_limit: float, max_nodes: int | None, callback: Callable[[int, float], None] | None
+) -> bool:
     """Expand configurations until nothing is left, plans no longer get better, or time is out; say whether it is."""
     begin = time.monotonic()
     while search.queue:
@@ -146,7 +150,7 @@ def _run(search: _Search, time_limit: float, callback: Callable[[int, float], No
             continue
         if search.plans and _has_lost_patience(search):
             return False
-        if time.monotonic() - begin > time_limit:
+        if time.monotonic() - begin > time_limit or search.nodes == max_nodes:
             return True
         _expand(search, z, steps, names)
         if search.nodes == 1:  # the first expansion compiles: that is no time of the search

@@ -1,0 +1,140 @@
+"""Which hand? Proportions with which the plan to a goal has the largest certificate.
+
+Hands of a grid over finger length and joint distance are tried, then those about the best one at half the spacing. On
+each the object begins as in the scene, lying on the same edge, with the fingers closed anew. The search on each hand is
+limited by configurations, not by time, so that the same call finds the same hand.
+"""
+
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from wholearm_jax.core import as_device_array
+from wholearm_jax.model import Hand, Scene, edge_on_palm, link_overlaps, resting_configuration
+from wholearm_jax.planning.search import PlanningResult, plan
+
+PROPORTION_DECIMALS = 4  # of the lengths that are tried [m]
+
+
+@dataclass(frozen=True)
+class HandTrial:
+    """A hand that was tried: finger length and distance of each joint from the middle [m], and its plan's certificate.
+
+    `bound` [N] is `-inf` where no plan was found, and NaN where the hand does not close on the object.
+    """
+
+    length: float
+    joint: float
+    bound: float
+
+
+@dataclass(frozen=True)
+class HandSearchResult:
+    """The best hand of those that were tried, the scene with it, and the plans on it."""
+
+    best: HandTrial | None  # None: no hand has a plan
+    scene: Scene
+    planning: PlanningResult | None
+    trials: tuple[HandTrial, ...]
+
+
+def plan_with_hand(
+    scene: Scene,
+    goal: Mapping[str, float] | None = None,
+    *,
+    length: tuple[float, float],
+    joint: tuple[float, float],
+    grid: int = 4,
+    refinements: int = 1,
+    max_nodes: int = 12,
+    callback: Callable[[int, float], None] | None = None,
+    **options: Any,
+) -> HandSearchResult:
+    """Search over a hand's proportions for those with which the plan to a goal has the largest certificate.
+
+    Args:
+        scene: the object at rest on an edge, and a hand, whose other properties stay; a finger's inertia grows with
+            the square of its length.
+        goal: as of `plan`.
+        length: least and largest finger length [m].
+        joint: least and largest distance of each joint from the middle [m].
+        grid: number of values of each in the first round.
+        refinements: rounds about the best hand, each at half the spacing of the one before.
+        max_nodes: configurations that the search on each hand expands.
+        callback: called with the number of hands tried and the largest certificate so far.
+        options: other arguments of `plan`: `by`, `tolerance`, `margin`, `count`, `max_phases`, `rolling`.
+
+    Raises:
+        ValueError: for ranges that are none, a start that does not lie on an edge, or a goal as `plan` refuses it.
+    """
+    for name, (low, high) in {"length": length, "joint": joint}.items():
+        if not 0 < low <= high < np.inf:
+            raise ValueError(f"{name}: the range must be of positive lengths, the smaller one first")
+    edge = edge_on_palm(scene.object, np.asarray(scene.start))
+    tried: dict[tuple[float, float], tuple[HandTrial, Scene, PlanningResult | None]] = {}
+
+    def attempt(proportions: tuple[float, float]) -> None:
+        if proportions in tried:
+            return
+        changed = _start_in(scene, edge, *proportions)
+        found = None if changed is None else plan(changed, goal, max_nodes=max_nodes, **options)
+        bound = np.nan if found is None else found.plans[0].bound if found.found else -np.inf
+        tried[proportions] = HandTrial(*proportions, float(bound)), changed or scene, found
+        if callback is not None:
+            callback(len(tried), max((one.bound for one, _, _ in tried.values() if one.bound > 0), default=0.0))
+
+    ranges = [length, joint]
+    for one, other in itertools.product(*(_values(*limits, grid) for limits in ranges)):
+        attempt((one, other))
+    spacing = [(high - low) / max(grid - 1, 1) for low, high in ranges]
+    for _ in range(refinements):
+        best = _best(tried)
+        if best is None:
+            break
+        spacing = [step / 2 for step in spacing]
+        near = [
+            _values(max(centre - step, low), min(centre + step, high), 3)
+            for centre, step, (low, high) in zip(best, spacing, ranges, strict=True)
+        ]
+        for one, other in itertools.product(*near):
+            attempt((one, other))
+    best = _best(tried)
+    trials = tuple(trial for trial, _, _ in tried.values())
+    return HandSearchResult(None, scene, None, trials) if best is None else HandSearchResult(*tried[best], trials)
+
+
+def _best(tried: Mapping[tuple[float, float], tuple[HandTrial, Scene, Any]]) -> tuple[float, float] | None:
+    """Return the proportions with the largest certificate, the first of equals."""
+    found = [(trial.bound, key) for key, (trial, _, _) in tried.items() if trial.bound > -np.inf]
+    return max(found, key=lambda row: round(row[0], 6))[1] if found else None
+
+
+def _values(low: float, high: float, count: int) -> list[float]:
+    """Return evenly spaced lengths."""
+    return sorted({round(float(value), PROPORTION_DECIMALS) for value in np.linspace(low, high, count)})
+
+
+def _start_in(scene: Scene, edge: int, length: float, joint: float) -> Scene | None:
+    """Put the object into a hand of other proportions; None where that does not close on it, or its links overlap."""
+    hand: Hand = scene.hand
+    heights = np.asarray(hand.joint)[:, 1]
+    changed = eqx.tree_at(
+        lambda h: (h.joint, h.length, h.inertia),
+        hand,
+        (
+            as_device_array(np.stack([[joint, -joint], heights], axis=1)),
+            as_device_array([length, length]),
+            as_device_array(np.asarray(hand.inertia) * (length / np.asarray(hand.length)) ** 2),
+        ),
+    )
+    try:
+        z = resting_configuration(scene.object, changed, edge, float(scene.start[0]))
+    except ValueError:
+        return None
+    if float(link_overlaps(changed, as_device_array(z[3:])).max()) >= 0:
+        return None
+    return eqx.tree_at(lambda s: (s.hand, s.start, s.phases), scene, (changed, as_device_array(z), ()))
