@@ -1,0 +1,68 @@
+"""The hand that is found: its plan arrives, no hand that was tried has a larger certificate, and it is found again."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.files import read_outline
+from wholearm_jax.model import edge_on_palm, resting_configuration
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory):
+    """A box 60 x 40 mm at rest, on the hand that was chosen for it."""
+    path = tmp_path_factory.mktemp("drawing") / "box.csv"
+    path.write_text("x [mm],y [mm]\n0,0\n60,0\n60,40\n0,40\n")
+    return wa.scene_from_outline(read_outline(path), mass=0.1)
+
+
+SEARCH = {"length": (0.1, 0.12), "joint": (0.036, 0.09), "grid": 2, "refinements": 0, "max_nodes": 1, "max_phases": 1}
+
+
+@pytest.fixture(scope="module")
+def found(box):
+    return wa.plan_with_hand(box, by={"x": -0.004}, **SEARCH)
+
+
+def test_the_best_of_the_hands_has_the_largest_certificate(box, found):
+    """Each hand that was tried is planned for by itself, from a scene that is put together here."""
+    assert len(found.trials) == 4
+    assert found.best.bound == max(one.bound for one in found.trials if not np.isnan(one.bound))
+    for one in found.trials:
+        hand = {"joint": [[one.joint, 0.0], [-one.joint, 0.0]], "length": [one.length] * 2}
+        inertia = np.asarray(box.hand.inertia) * (one.length / np.asarray(box.hand.length)) ** 2
+        new = tuple(np.asarray(value) for value in (*hand.values(), inertia))
+        scene = eqx.tree_at(lambda s: (s.hand.joint, s.hand.length, s.hand.inertia), box, new)
+        if np.isnan(one.bound):
+            continue
+        z = resting_configuration(scene.object, scene.hand, 0, 0.0)
+        scene = eqx.tree_at(lambda s: s.start, scene, np.asarray(z))
+        planned = wa.plan(scene, by={"x": -0.004}, max_phases=1, max_nodes=1)
+        assert planned.found == np.isfinite(one.bound)
+        if planned.found:
+            assert planned.plans[0].bound == pytest.approx(one.bound, rel=1e-9)
+
+
+def test_the_plan_on_the_best_hand_arrives(box, found):
+    best = found.planning.plans[0]
+    traced = wa.trace(best.scene)
+    assert float(traced[-1].end[0] - box.start[0]) == pytest.approx(-0.004, abs=1e-3)
+    assert np.asarray(best.scene.hand.length).tolist() == [found.best.length] * 2
+    assert np.asarray(found.scene.hand.joint)[:, 0].tolist() == [found.best.joint, -found.best.joint]
+
+
+def test_where_no_hand_has_a_plan_the_scene_stays(box):
+    found = wa.plan_with_hand(box, by={"x": -0.5}, **SEARCH)
+    assert found.best is None
+    assert found.planning is None
+    assert found.scene is box
+
+
+def test_ranges_and_starts_that_cannot_be_are_refused(box):
+    with pytest.raises(ValueError, match="joint: the range must be"):
+        wa.plan_with_hand(box, by={"x": -0.01}, length=(0.1, 0.2), joint=(0.05, 0.04))
+    raised = eqx.tree_at(lambda s: s.start, box, np.asarray(box.start) + [0, 1e-3, 0, 0, 0])
+    with pytest.raises(ValueError, match="does not lie on an edge"):
+        wa.plan_with_hand(raised, by={"x": -0.01}, length=(0.1, 0.2), joint=(0.04, 0.05))
+    assert edge_on_palm(box.object, np.asarray(box.start)) == 0
