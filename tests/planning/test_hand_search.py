@@ -62,7 +62,7 @@ def test_where_no_hand_has_a_plan_the_scene_stays(box):
 def test_ranges_and_starts_that_cannot_be_are_refused(box):
     with pytest.raises(ValueError, match="joint: the range must be"):
         wa.plan_with_hand(box, by={"x": -0.01}, length=(0.1, 0.2), joint=(0.05, 0.04))
-    raised = eqx.tree_at(lambda s: s.start, box, np.asarray(box.start) + [0, 1e-3, 0, 0, 0])
+    raised = eqx.tree_at(lambda s: s.start, box, np.add(box.start, [0, 1e-3, 0, 0, 0]))
     with pytest.raises(ValueError, match="does not lie on an edge"):
         wa.plan_with_hand(raised, by={"x": -0.01}, length=(0.1, 0.2), joint=(0.04, 0.05))
     assert edge_on_palm(box.object, np.asarray(box.start)) == 0
