@@ -24,7 +24,16 @@ PAGES = [
     *(ROOT / name / "README.md" for name in ("notebooks", "benchmarks", "tests")),
 ]
 # What is made by, or given to, those that have one; and what takes long to compile and is tested by itself.
-WITHOUT_EXAMPLE = {"IntegratorOptions", "TorqueSchedule", "check", "plan", "plan_with_hand"}
+WITHOUT_EXAMPLE = {
+    "Controller",
+    "IntegratorOptions",
+    "TorqueSchedule",
+    "check",
+    "feedback",
+    "plan",
+    "plan_with_hand",
+    "write_controller",
+}
 
 
 def defined_names() -> set[str]:
