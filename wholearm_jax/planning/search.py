@@ -170,9 +170,14 @@ def _add_plan(search: _Search, steps: tuple[Step, ...]) -> None:
     found = make_plan(search.scene, search.start, steps, search.duration, search.goal)
     if found is None or found.bound <= search.floor:
         return
-    search.nodes_of_last_plan = search.nodes
     ranked = sorted([*search.plans, found], key=lambda one: (-round(one.bound, 6), len(one.steps)))
-    search.plans[:] = ranked[: search.count]
+    different = {}  # plans of the same formations that change elsewhere are one
+    for one in ranked:
+        different.setdefault(tuple((step.contacts, step.toward) for step in one.steps), one)
+    if all(one is not found for one in different.values()):
+        return
+    search.nodes_of_last_plan = search.nodes
+    search.plans[:] = list(different.values())[: search.count]
     if len(search.plans) == search.count:
         search.floor = search.plans[-1].bound
 
