@@ -33,7 +33,7 @@ def plot_search(found: PlanningResult, ax: Axes | None = None) -> Axes:
     ax.set(xlabel="$x$ [mm]", ylabel=r"$\varphi$ [deg]", title=f"{found.nodes} poses expanded, {found.moves} paths")
     ax.autoscale_view()
     ax.spines[["top", "right"]].set_visible(False)
-    ax.legend(frameon=False)
+    ax.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)  # data may be anywhere
     return ax
 
 
