@@ -16,6 +16,7 @@ from wholearm_jax.cli.arguments import (
     SceneName,
     load_scene,
     make_output_folder,
+    note,
     parse_ensemble,
 )
 from wholearm_jax.cli.output import write_and_exit, write_result
@@ -55,11 +56,12 @@ def optimise(
     """Find the torques with the largest compressive margin, and check them by simulation."""
     if report and out is None:
         raise BadInput("--report: needs a folder to write to: add --out DIR")
-    if feedback and (out is None or robust):
-        raise BadInput("--feedback: knows no --robust" if robust else "--feedback: needs --out DIR to write to")
+    if feedback and out is None:
+        raise BadInput("--feedback: needs --out DIR to write to")
     loaded = load_scene(scene, set_)
     folder = make_output_folder(out)
-    if robust:
+    uncertain = _uncertain_set(loaded, robust, seed) if feedback else {}
+    if robust and not feedback:
         others = (("rate-limit", rate_limit), ("passing", passing), ("margin", margin))
         unknown = [name for name, value in others if value is not None]
         if unknown:
@@ -82,19 +84,45 @@ def optimise(
     if not as_json:
         _print_optimised(optimum)
     values = tuple(float(b.value) for b in optimum.bounds)
-    controller = _design(optimum, as_json) if feedback and optimum.result.status is Status.OK else None
+    controller = _design(optimum, uncertain, as_json) if feedback and optimum.result.status is Status.OK else None
     more |= {"controller": controller, "bounds": values}
+    if feedback and controller is None and optimum.result.status is Status.OK:
+        write_result(optimum.result, folder, samples or 201, as_json, report=report, **more)
+        sys.exit(1)
     write_and_exit(optimum.result, folder, samples or 201, as_json, report=report, **more)
 
 
-def _design(optimum, as_json: bool):
-    """Design the closed-loop law of an optimised plan, and say which margin each phase keeps."""
+def _uncertain_set(scene, robust: list[str] | None, seed: int) -> dict[str, float]:
+    """Return the half widths of friction and mass that a closed-loop law is designed for."""
+    spreads = dict(parse_ensemble(scene, robust or ["friction=20%"], seed).spreads)
+    known = all(name in ("friction", "mass") and spread.relative for name, spread in spreads.items())
+    if not known:
+        raise BadInput("--feedback: --robust knows friction=20% and mass=10%, as fractions")
+    return {name: spread.size for name, spread in spreads.items()}
+
+
+def _design(optimum, uncertain: dict[str, float], as_json: bool):
+    """Design the closed-loop law of an optimised plan, and say which margin each phase keeps; None where it keeps none.
+
+    Args:
+        optimum: the result of `optimise`.
+        uncertain: half widths of friction and mass.
+        as_json: whether standard output is for JSON alone.
+    """
     from wholearm_jax.feedback import feedback
 
-    controller = feedback(optimum.scene, optimum.torque)
+    friction, mass = (uncertain.get(name, 0.0) for name in ("friction", "mass"))
+    controller = feedback(optimum.scene, optimum.torque, friction=friction, mass=mass)
     for phase in controller.phases if not as_json else ():
-        print(f"{phase.name}: closed loop, least force {phase.margin:.4g} N over the friction of all links +-20 %")
-    return controller
+        print(f"{phase.name}: closed loop, least force {phase.margin:.4g} N over all objects of the set")
+    weakest = min(controller.phases, key=lambda phase: phase.margin)
+    if weakest.margin > 0:
+        return controller
+    note(
+        f"no controller.json: in '{weakest.name}' a contact of some object of the set would open, least force "
+        f"{weakest.margin:.3g} N; a smaller set is written as --robust friction=10%"
+    )
+    return None
 
 
 def _optimise_scene(name: str, scene, options: dict):
