@@ -1,6 +1,8 @@
 """Closed-loop laws: their design, their file, an independent reading of both, and executions under other friction."""
 
+import importlib
 import json
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
@@ -116,3 +118,27 @@ def test_a_controller_of_another_plan_is_refused(controller):
 def test_numbers_out_of_range_are_refused(scene, wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         wa.feedback(scene, wa.quasistatic(scene), **wrong)
+
+
+@pytest.mark.parametrize(("least", "code"), [(0.1, 0), (-0.1, 1)])
+def test_a_law_is_written_only_where_it_holds_the_whole_set(least, code, wholearm, monkeypatch, controller, tmp_path):
+    asked = []
+
+    def design(*_, **uncertain):
+        asked.append(uncertain)
+        return replace(controller, phases=tuple(replace(phase, margin=least) for phase in controller.phases))
+
+    monkeypatch.setattr(importlib.import_module("wholearm_jax.feedback"), "feedback", design)
+    given = ("optimise", "heptagon", "--feedback", "--robust", "friction=10%", "--knots", "11", "--out", tmp_path)
+    status, out, err = wholearm(*given)
+    assert status == code
+    assert asked == [{"friction": 0.1, "mass": 0.0}]
+    assert (tmp_path / "controller.json").exists() == (code == 0)
+    assert (tmp_path / "torque.csv").exists()
+    assert ("would open" in err) == (code == 1)
+
+
+def test_sets_that_a_law_does_not_know_are_refused(wholearm, tmp_path):
+    status, _, err = wholearm("optimise", "heptagon", "--feedback", "--robust", "vertices=0.001", "--out", tmp_path)
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert "--robust knows friction=20% and mass=10%" in err
