@@ -130,7 +130,7 @@ def test_a_law_is_written_only_where_it_holds_the_whole_set(least, code, wholear
 
     monkeypatch.setattr(importlib.import_module("wholearm_jax.feedback"), "feedback", design)
     given = ("optimise", "heptagon", "--feedback", "--robust", "friction=10%", "--knots", "11", "--out", tmp_path)
-    status, out, err = wholearm(*given)
+    status, _, err = wholearm(*given)
     assert status == code
     assert asked == [{"friction": 0.1, "mass": 0.0}]
     assert (tmp_path / "controller.json").exists() == (code == 0)
