@@ -77,7 +77,7 @@ def make_plan(
     """Trace steps as a plan at full resolution; None where a phase cannot be traced, or the goal is missed."""
     phases = tuple(
         Phase(
-            f"{k + 1}: {' '.join(step.contacts)}",
+            f"{k + 1}: {step.toward}",
             contact_formation(step.contacts),
             path_target(step.toward, dict([step.until]) if step.until else None),
             as_device_array(duration),

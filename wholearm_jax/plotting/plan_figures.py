@@ -67,7 +67,7 @@ def plot_forces(result: Result, ax: Axes | None = None, *, legend: bool = True) 
 
 def _shade_rests(result: Result, ax: Axes) -> None:
     """Shade the times at which friction holds the object at rest, with the margin of each rest."""
-    label: str = "held: the best least force"
+    label: str = "held at rest"
     for rest in (rest for phase in result.phases for rest in phase.holds):
         ax.axvspan(rest.start, rest.end, color=PALE, alpha=0.35, lw=0, zorder=0)
         if np.isfinite(rest.margin):
@@ -99,7 +99,7 @@ def _mark_margin(result: Result, ax: Axes) -> None:
 def plot_result(result: Result, axes=None) -> np.ndarray:
     """Joint torques above contact forces on one time axis; takes and returns two axes."""
     if axes is None:
-        _, axes = plt.subplots(2, 1, figsize=(COLUMN, 3.9), sharex=True, layout="constrained", height_ratios=(2, 3))
+        _, axes = plt.subplots(2, 1, figsize=(COLUMN, 4.7), sharex=True, layout="constrained", height_ratios=(2, 3))
     plot_torques(result, axes[0], legend=False).set_xlabel("")
     plot_forces(result, axes[1]).set_title("")
     add_legend_below(axes[0], 2)
