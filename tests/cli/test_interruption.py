@@ -37,14 +37,17 @@ def test_ctrl_c_while_it_imports_traces_and_compiles(moment, tmp_path):
 
 def test_a_process_of_ones_own_keeps_its_handler():
     """`main` called from Python, as by these tests, hands SIGINT back."""
-    before = signal.getsignal(signal.SIGINT)
-    restore = exit_on_interrupt()
-    assert signal.getsignal(signal.SIGINT) is not before
-    restore()
-    assert signal.getsignal(signal.SIGINT) is before
-    with pytest.raises(KeyboardInterrupt):
-        signal.raise_signal(signal.SIGINT)
-    time.sleep(0.1)  # the thread that waits for signals has seen it, and has not ended the process
+    own = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a process in the background may ignore
+    try:
+        restore = exit_on_interrupt()
+        assert signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+        restore()
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        time.sleep(0.1)  # the thread that waits for signals has seen it, and has not ended the process
+    finally:
+        signal.signal(signal.SIGINT, own)
 
 
 def test_ctrl_c_waits_for_files_that_are_being_written(tmp_path):
