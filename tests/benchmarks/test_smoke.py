@@ -25,7 +25,18 @@ RUNS = {  # what each runs, after `import NAME as module`
     "skipping": "module.problems = lambda **_: PROBLEMS(referred=False)[:1]; run('--quick')",
     "work_precision": "print(module.in_turn(PROBLEMS(referred=False)[0], 'Dopri8', 1e-7, 1))",
 }
-SLOW = ("batch", "cold_start", "gradients", "optimisation", "prediction", "skipping", "work_precision")
+SLOW = (
+    "batch",
+    "cold_start",
+    "execution",
+    "feedback",
+    "flying_plans",
+    "gradients",
+    "optimisation",
+    "prediction",
+    "skipping",
+    "work_precision",
+)
 NEEDS = {"collocation": "casadi", "optimisation": "casadi", "skipping": "numba", "work_precision": "numba"}
 PRELUDE = """
 import sys, jax, wholearm_jax

@@ -17,6 +17,7 @@ def slide():
     return scene, wa.quasistatic(scene)
 
 
+@pytest.mark.slow
 def test_all_inputs_of_a_bundled_phase(slide):
     scene, even = slide
     torque = wa.TorqueSchedule(1.01 * even.times, 0.99 * even.values)

@@ -58,7 +58,7 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=[*CASES, "torques that step"])
+@pytest.fixture(scope="module", params=[*CASES, pytest.param("torques that step", marks=pytest.mark.slow)])
 def case(request):
     if request.param == "torques that step":
         return stepping(*one_phase(*CASES["time runs out"]))

@@ -1,8 +1,5 @@
 """Plans from a start and a goal: traced anew, they arrive; where there is none, the reason is right."""
 
-import subprocess
-import sys
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -150,15 +147,15 @@ def test_the_file_says_start_and_goal(tmp_path):
         load_goal(write_scene(tmp_path, goal={"z": 1.0}))
 
 
-def test_the_command_writes_a_scene_that_optimise_takes(tmp_path):
+def test_the_command_writes_a_scene_that_optimise_takes(wholearm, tmp_path):
     path = write_scene(tmp_path)
-    command = [sys.executable, "-m", "wholearm_jax", "plan", str(path), "--by", "x=-0.03", "--count", "1"]
-    done = subprocess.run([*command, "--out", str(tmp_path / "out")], capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr
-    assert "bound" in done.stdout
+    code, out, err = wholearm("plan", path, "--by", "x=-0.03", "--count", "1", "--out", tmp_path / "out")
+    assert code == 0, err
+    assert "bound" in out
     planned = wa.load(tmp_path / "out" / "plan.toml")
     assert len(planned.phases) == 1
     assert (tmp_path / "out" / "plan.png").exists()
-    refused = subprocess.run([*command[:5], "--by", "q=1"], capture_output=True, text=True, timeout=600)
-    assert refused.returncode == 2
-    assert "write coordinates and values" in refused.stderr
+    assert (tmp_path / "out" / "search.png").exists()
+    refused, _, err = wholearm("plan", path, "--by", "q=1")
+    assert refused == 2
+    assert "write coordinates and values" in err
