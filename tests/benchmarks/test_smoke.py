@@ -25,18 +25,7 @@ RUNS = {  # what each runs, after `import NAME as module`
     "skipping": "module.problems = lambda **_: PROBLEMS(referred=False)[:1]; run('--quick')",
     "work_precision": "print(module.in_turn(PROBLEMS(referred=False)[0], 'Dopri8', 1e-7, 1))",
 }
-SLOW = "batch cold_start execution feedback flying_plans gradients optimisation prediction skipping work_precision"
-    "batch",
-    "cold_start",
-    "execution",
-    "feedback",
-    "flying_plans",
-    "gradients",
-    "optimisation",
-    "prediction",
-    "skipping",
-    "work_precision",
-)
+QUICK = ("collocation", "interruption", "planning", "random_plans")
 NEEDS = {"collocation": "casadi", "optimisation": "casadi", "skipping": "numba", "work_precision": "numba"}
 PRELUDE = """
 import sys, jax, wholearm_jax
@@ -71,7 +60,7 @@ def test_every_script_is_run():
     assert folders == {"stability"}
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW.split() else ()) for name in RUNS])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in RUNS])
 def test_benchmark_runs_on_its_smallest_part(name, tmp_path):
     pytest.importorskip(NEEDS.get(name, "numpy"))
     assert run_apart(PRELUDE.format(name=name) + RUNS[name], tmp_path)
