@@ -8,7 +8,7 @@ from support import layered
 import wholearm_jax as wa
 from wholearm_jax.core import as_device_array
 from wholearm_jax.margin import PROGRAMME_INTERVALS, rest_to_rest
-from wholearm_jax.model import replace_duration
+from wholearm_jax.model import path_target, replace_duration
 from wholearm_jax.optimisation import path_margin
 from wholearm_jax.phases import trace
 
@@ -75,3 +75,15 @@ def test_more_intervals_lower_the_bound_by_little(plan):
         for n in (PROGRAMME_INTERVALS // 2, PROGRAMME_INTERVALS)
     )
     assert fine * (1 - 1e-6) <= coarse < fine * (1 + 2e-3)
+
+
+def test_the_bound_covers_motions_that_are_fast_after_a_wait():
+    """A flip that ends early: it waits and moves faster than eight path lengths a duration, beyond the pointwise bound."""
+    scene = wa.load("heptagon")
+    target = path_target("phi-", {"phi": 0.81866})
+    scene = eqx.tree_at(lambda s: s.phases[1].target, scene, target)
+    found = wa.optimise(scene)
+    assert found.result.status is wa.Status.OK
+    assert found.result.phases[1].margin > float(wa.bounds(scene)[1].value)
+    for phase, bound in zip(found.result.phases, found.bounds, strict=True):
+        assert 0.999 * float(bound.value) < phase.margin <= float(bound.value)

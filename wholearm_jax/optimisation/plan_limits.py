@@ -1,6 +1,7 @@
 """What no schedule can exceed: the bound of each phase's margin in its duration, and the shortest duration.
 
-The bound is the smaller of the pointwise one (`quasistatic_plan.bounds`) and the margin of the convex optimum.
+The bound is the margin of the convex optimum, which covers motions of every speed; where no motion takes so little
+time, the pointwise one (`quasistatic_plan.bounds`).
 """
 
 from wholearm_jax.core import as_device_array
@@ -12,7 +13,7 @@ from wholearm_jax.phases import TracedPhase, trace
 
 
 def certified_bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[MarginBound, ...]:
-    """Return for each phase the smaller of its pointwise bound and its convex one, in the phase's duration.
+    """Return for each phase the bound of its margin in the phase's duration, that of the best motion.
 
     Where no motion takes so little time, it is the pointwise bound.
 
@@ -33,10 +34,14 @@ def certified_bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> t
 def tighten_bounds(
     pointwise: tuple[MarginBound, ...], motions: tuple[BestMotion | None, ...], traced: tuple[TracedPhase, ...]
 ) -> tuple[MarginBound, ...]:
-    """Return the smaller of each phase's pointwise bound and the margin of its best motion, where that is feasible."""
+    """Return the margin of each phase's best motion, and its pointwise bound where there is none.
+
+    The pointwise bound covers speeds up to multiples of a path length a duration; an object that waits may be faster
+    than that afterwards, and only the best motion covers every speed.
+    """
 
     def tighter(bound: MarginBound, motion: BestMotion | None, path: TracedPhase) -> MarginBound:
-        if motion is None or not motion.feasible or not 0 < motion.margin < float(bound.value):
+        if motion is None or not motion.feasible or not motion.margin > 0 or float(bound.value) <= 0:
             return bound
         s = path.dynamics.breakpoints[0] + motion.hardest_place * path.dynamics.length
         return MarginBound(*(as_device_array(a) for a in (motion.margin, s, motion.hardest_place)))
