@@ -78,7 +78,7 @@ def test_more_intervals_lower_the_bound_by_little(plan):
 
 
 def test_the_bound_covers_motions_that_are_fast_after_a_wait():
-    """A flip that ends early: it waits and moves faster than eight path lengths a duration, beyond the pointwise bound."""
+    """A flip that ends early waits, and then moves faster than eight path lengths a duration: beyond `wa.bounds`."""
     scene = wa.load("heptagon")
     target = path_target("phi-", {"phi": 0.81866})
     scene = eqx.tree_at(lambda s: s.phases[1].target, scene, target)
