@@ -177,7 +177,7 @@ def optimise(
     motions = convex_bounds(longest, traced=traced)
     limits = PlanLimits(
         pointwise,
-        tighten_bounds(pointwise, motions, traced),
+        tighten_bounds(scene, pointwise, motions, traced),
         too_short_phases(longest, pointwise, motions, traced),
     )
 

@@ -1,12 +1,12 @@
 """What no schedule can exceed: the bound of each phase's margin in its duration, and the shortest duration.
 
-The bound is the margin of the convex optimum, which covers motions of every speed; where no motion takes so little
-time, the pointwise one (`quasistatic_plan.bounds`).
+The bound is the margin of the convex optimum, which covers motions of every speed. For a phase that is entered or left
+at speed, which cannot wait first, it is the pointwise one (`quasistatic_plan.bounds`) where that is smaller.
 """
 
 from wholearm_jax.core import as_device_array
 from wholearm_jax.margin import MarginBound
-from wholearm_jax.model import Scene
+from wholearm_jax.model import Arrival, Scene
 from wholearm_jax.optimisation.best_motion import BestMotion, convex_bounds, shortest_motions
 from wholearm_jax.optimisation.quasistatic_plan import bounds
 from wholearm_jax.phases import TracedPhase, trace
@@ -28,25 +28,33 @@ def certified_bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> t
         RuntimeError: without float64.
     """
     traced = traced or trace(scene)
-    return tighten_bounds(bounds(scene, traced=traced), convex_bounds(scene, traced=traced), traced)
+    return tighten_bounds(scene, bounds(scene, traced=traced), convex_bounds(scene, traced=traced), traced)
 
 
 def tighten_bounds(
-    pointwise: tuple[MarginBound, ...], motions: tuple[BestMotion | None, ...], traced: tuple[TracedPhase, ...]
+    scene: Scene,
+    pointwise: tuple[MarginBound, ...],
+    motions: tuple[BestMotion | None, ...],
+    traced: tuple[TracedPhase, ...],
 ) -> tuple[MarginBound, ...]:
-    """Return the margin of each phase's best motion, and its pointwise bound where there is none.
+    """Return the margin of each phase's best motion, or its pointwise bound.
 
     The pointwise bound covers speeds up to multiples of a path length a duration; an object that waits may be faster
-    than that afterwards, and only the best motion covers every speed.
+    than that afterwards, and only the best motion covers every speed. A phase that is entered or left at speed has the
+    smaller of both.
     """
+    flows = [phase.arrive is Arrival.MOVING for phase in scene.phases]
+    cannot_wait = [left or entered for left, entered in zip(flows, [False, *flows[:-1]], strict=True)]
 
-    def tighter(bound: MarginBound, motion: BestMotion | None, path: TracedPhase) -> MarginBound:
+    def tighter(bound: MarginBound, motion: BestMotion | None, path: TracedPhase, moves: bool) -> MarginBound:
         if motion is None or not motion.feasible or not motion.margin > 0 or float(bound.value) <= 0:
+            return bound
+        if moves and motion.margin >= float(bound.value):
             return bound
         s = path.dynamics.breakpoints[0] + motion.hardest_place * path.dynamics.length
         return MarginBound(*(as_device_array(a) for a in (motion.margin, s, motion.hardest_place)))
 
-    return tuple(tighter(*row) for row in zip(pointwise, motions, traced, strict=True))
+    return tuple(tighter(*row) for row in zip(pointwise, motions, traced, cannot_wait, strict=True))
 
 
 def too_short_phases(
