@@ -140,7 +140,8 @@ def test_durations_are_free_within_their_range():
     assert float(free.scene.phases[0].duration) != pytest.approx(1.0, abs=1e-3)
     assert free.result.margin >= 0.999 * fixed.result.margin
     shortest = eqx.tree_at(lambda s: s.phases[0].duration, scene, jnp.asarray(0.5))
-    assert float(free.bounds[0].value) == float(wa.bounds(shortest)[0].value), "no duration allows more"
+    assert float(free.bounds[0].value) == pytest.approx(float(wa.bounds(shortest)[0].value), rel=1e-6)
+    assert free.result.margin <= float(free.bounds[0].value), "no duration allows more"
 
 
 def test_any_optax_optimiser_descends():
