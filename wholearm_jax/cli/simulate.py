@@ -43,12 +43,12 @@ def simulate(
     compiled = precompile_simulate(loaded, schedule, tolerance)
     traced = trace_or_exit(scene, loaded)
     wait_for(compiled)
-    margin_bounds = bounds(loaded, traced=traced)
-    result = explain(simulate_or_exit(loaded, schedule, torque, tolerance, traced), margin_bounds=margin_bounds)
+    pointwise = bounds(loaded, traced=traced)
+    result = explain(simulate_or_exit(loaded, schedule, torque, tolerance, traced), margin_bounds=pointwise)
     if not as_json:
         print_phases(result)
     gradient = _check_gradient(loaded, schedule, as_json) if check_gradient else {}
-    values = tuple(float(b.value) for b in certified_bounds(loaded, traced=traced))
+    values = tuple(float(b.value) for b in certified_bounds(loaded, traced=traced, pointwise=pointwise))
     more = {"command": "simulate", "torque": str(torque), "tolerance": tolerance} | gradient
     write_and_exit(result, folder, samples, as_json, bounds=values, **more)
 

@@ -49,8 +49,13 @@ def require_same_plan(controller: Controller, scene: Scene) -> None:
         raise ValueError(f"the controller is for another plan ('{controller.title}'): its contact formations differ")
 
 
-def closed_loop_step(hardware: Hardware, timestep: float) -> float:
-    """Return the time step [s] next to `timestep` of which the sampling period is a multiple."""
+def closed_loop_step(controller: Controller, hardware: Hardware, scene: Scene, timestep: float) -> float:
+    """Return the time step [s] next to `timestep` of which the sampling period is a multiple.
+
+    Raises ValueError for hardware that cannot be, and where the controller is for another plan.
+    """
+    require_hardware(hardware)
+    require_same_plan(controller, scene)
     return 1 / hardware.rate / max(1, round(1 / hardware.rate / timestep))
 
 

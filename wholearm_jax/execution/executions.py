@@ -27,8 +27,6 @@ from wholearm_jax.execution.closed_loop import (
     ControlledMotor,
     Hardware,
     closed_loop_step,
-    require_hardware,
-    require_same_plan,
 )
 from wholearm_jax.execution.coulomb_friction import advance
 from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
@@ -171,9 +169,7 @@ def execute(
     times, step = clock(scene, timestep)
     torques: Float[np.ndarray, "steps 2"] | Motor = motor_torques(prediction.torque, times, step)
     if controller is not None:
-        require_hardware(hardware)
-        require_same_plan(controller, scene)
-        step = closed_loop_step(hardware, timestep)
+        step = closed_loop_step(controller, hardware, scene, timestep)
         torques = ControlledMotor(controller, hardware, step, seed)
     bodies = build_mujoco_model(scene, step, softness)
     course, creep, met = run_schedule(bodies, scene, start_of(prediction), torques, step)

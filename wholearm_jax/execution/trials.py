@@ -32,8 +32,6 @@ from wholearm_jax.execution.closed_loop import (
     ControlledMotor,
     Hardware,
     closed_loop_step,
-    require_hardware,
-    require_same_plan,
 )
 from wholearm_jax.execution.executions import (
     ExecutionOutcome,
@@ -154,9 +152,7 @@ def run_trials(
     begins, step = clock(prediction.scene, timestep)
     drives: Iterator = itertools.repeat(motor_torques(prediction.torque, begins, step))
     if controller is not None:
-        require_hardware(hardware)
-        require_same_plan(controller, prediction.scene)
-        step = closed_loop_step(hardware, timestep)
+        step = closed_loop_step(controller, hardware, prediction.scene, timestep)
         drives = (ControlledMotor(controller, hardware, step, seed + k) for k in itertools.count())
     nominal, target = start_of(prediction), target_of(prediction)
     laid = [

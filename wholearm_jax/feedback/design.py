@@ -18,7 +18,15 @@ from wholearm_jax.feedback.reference_motion import (
 from wholearm_jax.feedback.stop_torque import choose_push
 from wholearm_jax.feedback.torque_choice import TorqueChoice, choose_torques
 from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, contact_formation
-from wholearm_jax.phases import TracedPhase, describe_end, simulate, trace, trajectory
+from wholearm_jax.phases import (
+    TracedPhase,
+    describe_end,
+    group_phases,
+    require_motion,
+    simulate,
+    trace,
+    trajectory,
+)
 from wholearm_jax.tracing import PathEnd
 
 RESERVE = 0.9  # fraction of the torque limits that the reference's torques and their corrections stay within
@@ -67,8 +75,7 @@ def feedback(
     require_positive(stiffness=stiffness, integral=integral, observer=observer)
     if not (0 <= friction < 1 and 0 <= mass < 1):
         raise ValueError("friction, mass: shares of at least 0 and less than 1")
-    if any(phase.arrive is Arrival.HOLD for phase in scene.phases):
-        raise ValueError("feedback: knows no phases that only hold the object")
+    require_motion(scene)
     result = simulate(scene, schedule)
     for phase in result.phases:
         if int(phase.traced.dynamics.status) != Status.OK:
@@ -79,7 +86,7 @@ def feedback(
     terms = [[path_terms(paths[k].dynamics, table) for paths in traces] for k, table in enumerate(tables)]
     limit = RESERVE * np.asarray(scene.hand.torque_limit)
     laws = []
-    for group in _groups(scene):
+    for group in group_phases(scene):
         options = _motions(scene, group, tables, trajectory(result), own_motion)
         choices = [[_choose(terms[k], tables[k], limit, m) for k, m in zip(group, o, strict=True)] for o in options]
         best = int(np.argmax([min(float(c.margin.min()) for c in row) for row in choices]))
@@ -96,17 +103,6 @@ def feedback(
         patience=LONGEST_DELAY,
         torque_limit=np.asarray(scene.hand.torque_limit),
     )
-
-
-def _groups(scene: Scene) -> list[list[int]]:
-    """Phases that follow one another without a stop."""
-    groups = [[0]]
-    for k, phase in enumerate(scene.phases[:-1]):
-        if phase.arrive is Arrival.MOVING:
-            groups[-1].append(k + 1)
-        else:
-            groups.append([k + 1])
-    return groups
 
 
 def _motions(scene: Scene, group, tables, courses, own_motion: bool) -> list[list[ReferenceMotion]]:

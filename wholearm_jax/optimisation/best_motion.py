@@ -13,7 +13,7 @@ from wholearm_jax.core import CachedJit, Status, as_device_array, require_x64
 from wholearm_jax.margin import PROGRAMME_INTERVALS, PathOptimum, SpeedRange, largest_margin, shortest_duration
 from wholearm_jax.model import Arrival, Phase, Scene
 from wholearm_jax.optimisation.quasistatic_plan import rolling_count
-from wholearm_jax.phases import TracedPhase, trace
+from wholearm_jax.phases import TracedPhase, starts_at_rest, trace
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,6 @@ def shortest_motions(
 def _each_phase(scene: Scene, traced, solve) -> tuple[BestMotion | None, ...]:
     """Solve the programme of each phase that moves the object."""
     require_x64(scene)
-    starts_at_rest = [True, *(p.arrive is not Arrival.MOVING for p in scene.phases[:-1])]
 
     def best(path, phase, from_rest):
         if phase.arrive is Arrival.HOLD or int(path.dynamics.status) != Status.OK:
@@ -121,7 +120,7 @@ def _each_phase(scene: Scene, traced, solve) -> tuple[BestMotion | None, ...]:
         speeds = SpeedRange(*(as_device_array(a) for a in (*ends, np.full(2, np.inf))))
         return _best_motion(path, phase, solve(path, phase, speeds))
 
-    return tuple(best(*row) for row in zip(traced or trace(scene), scene.phases, starts_at_rest, strict=True))
+    return tuple(best(*row) for row in zip(traced or trace(scene), scene.phases, starts_at_rest(scene), strict=True))
 
 
 def _best_motion(path: TracedPhase, phase: Phase, optimum: PathOptimum) -> BestMotion:

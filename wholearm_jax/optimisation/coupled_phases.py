@@ -124,15 +124,6 @@ class CoupledPhases:
         return np.array([float(bound.value) for bound in self.margin_bounds])
 
 
-def group_phases(scene: Scene) -> list[list[int]]:
-    """Return the numbers of the phases in each group of those that follow one another at speed."""
-    groups, starts_at_rest = [], True
-    for index, phase in enumerate(scene.phases):
-        groups = [*groups, [index]] if starts_at_rest else [*groups[:-1], [*groups[-1], index]]
-        starts_at_rest = phase.arrive is not Arrival.MOVING
-    return groups
-
-
 def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> GroupSolution:
     """Solve from one initial guess after the other, until one comes near the bound or two agree.
 

@@ -55,7 +55,6 @@ from wholearm_jax.optimisation.coupled_phases import (
     CoupledPhases,
     GroupSolution,
     OptimiseOptions,
-    group_phases,
     solve_coupled_phases,
 )
 from wholearm_jax.optimisation.plan_limits import tighten_bounds, too_short_phases
@@ -65,7 +64,7 @@ from wholearm_jax.optimisation.quasistatic_plan import bounds, require_knots
 from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.optimisation.shortest_plan import shortest_plan
 from wholearm_jax.optimisation.solver import IterationRecord
-from wholearm_jax.phases import Result, TracedPhase, build_result, simulate_phases, trace
+from wholearm_jax.phases import Result, TracedPhase, build_result, group_phases, simulate_phases, trace
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
 MAX_DWELLS = (0.25, 0.1)  # fractions of a phase for which the object may wait before it starts, at limited rates

@@ -9,10 +9,12 @@ from wholearm_jax.margin import MarginBound
 from wholearm_jax.model import Arrival, Scene
 from wholearm_jax.optimisation.best_motion import BestMotion, convex_bounds, shortest_motions
 from wholearm_jax.optimisation.quasistatic_plan import bounds
-from wholearm_jax.phases import TracedPhase, trace
+from wholearm_jax.phases import TracedPhase, starts_at_rest, trace
 
 
-def certified_bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[MarginBound, ...]:
+def certified_bounds(
+    scene: Scene, *, traced: tuple[TracedPhase, ...] = (), pointwise: tuple[MarginBound, ...] = ()
+) -> tuple[MarginBound, ...]:
     """Return for each phase the bound of its margin in the phase's duration, that of the best motion.
 
     Where no motion takes so little time, it is the pointwise bound.
@@ -20,6 +22,7 @@ def certified_bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> t
     Args:
         scene: the plan.
         traced: the result of `trace`, to reuse it.
+        pointwise: the result of `bounds`, to reuse it.
 
     Returns:
         One `MarginBound` a phase: `value` [N], and where on the path it is tight.
@@ -28,7 +31,8 @@ def certified_bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> t
         RuntimeError: without float64.
     """
     traced = traced or trace(scene)
-    return tighten_bounds(scene, bounds(scene, traced=traced), convex_bounds(scene, traced=traced), traced)
+    pointwise = pointwise or bounds(scene, traced=traced)
+    return tighten_bounds(scene, pointwise, convex_bounds(scene, traced=traced), traced)
 
 
 def tighten_bounds(
@@ -43,8 +47,8 @@ def tighten_bounds(
     than that afterwards, and only the best motion covers every speed. A phase that is entered or left at speed has the
     smaller of both.
     """
-    flows = [phase.arrive is Arrival.MOVING for phase in scene.phases]
-    cannot_wait = [left or entered for left, entered in zip(flows, [False, *flows[:-1]], strict=True)]
+    pairs = zip(scene.phases, starts_at_rest(scene), strict=True)
+    cannot_wait = [phase.arrive is Arrival.MOVING or not from_rest for phase, from_rest in pairs]
 
     def tighter(bound: MarginBound, motion: BestMotion | None, path: TracedPhase, moves: bool) -> MarginBound:
         if motion is None or not motion.feasible or not motion.margin > 0 or float(bound.value) <= 0:

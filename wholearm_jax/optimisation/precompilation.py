@@ -11,7 +11,6 @@ from wholearm_jax.optimisation.best_motion import path_duration, path_margin
 from wholearm_jax.optimisation.constraints import Limits
 from wholearm_jax.optimisation.coupled_phases import (
     GUESS_TORQUE_FRACTION,
-    group_phases,
     solver_method,
     stack_dynamics,
 )
@@ -21,7 +20,7 @@ from wholearm_jax.optimisation.multiple_shooting import extra_parts
 from wholearm_jax.optimisation.quasistatic_plan import rolling_count, upper_bound
 from wholearm_jax.optimisation.solver import INTERVAL_OPTIONS
 from wholearm_jax.optimisation.variables import Variables
-from wholearm_jax.phases import precompile_simulation
+from wholearm_jax.phases import group_phases, precompile_simulation
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 from wholearm_jax.tracing import Resolution
 

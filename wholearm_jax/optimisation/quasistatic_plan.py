@@ -16,7 +16,7 @@ from wholearm_jax.margin import (
 from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, concatenate_schedules, uniform_schedule
 from wholearm_jax.optimisation.initial_guess import initial_guesses, transformed_rest_to_rest_torques
 from wholearm_jax.optimisation.plan_transitions import holding_schedule
-from wholearm_jax.phases import TracedPhase, statics_at_start, trace
+from wholearm_jax.phases import TracedPhase, starts_at_rest, statics_at_start, trace
 
 
 def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[TracedPhase, ...] = ()) -> TorqueSchedule:
@@ -105,7 +105,6 @@ def bounds(scene: Scene, *, traced: tuple[TracedPhase, ...] = ()) -> tuple[Margi
 def _transformed_bounds(scene: Scene, traced: tuple[TracedPhase, ...]) -> tuple[MarginBound, ...]:
     """Return the bounds of a plan that is being transformed."""
     _refuse_holds(scene, "bounds")
-    starts_at_rest = _starts_at_rest(scene)
 
     def bound(path, phase, from_rest):
         ends = jnp.asarray(from_rest), jnp.asarray(phase.arrive is Arrival.AT_REST)
@@ -114,17 +113,11 @@ def _transformed_bounds(scene: Scene, traced: tuple[TracedPhase, ...]) -> tuple[
         known = path.dynamics.status == int(Status.OK)
         return eqx.tree_at(lambda b: b.value, found, jnp.where(known, found.value, -jnp.inf))
 
-    return tuple(bound(*row) for row in zip(traced, scene.phases, starts_at_rest, strict=True))
-
-
-def _starts_at_rest(scene: Scene) -> list[bool]:
-    """Say for each phase whether it starts at rest."""
-    return [True, *(p.arrive is not Arrival.MOVING for p in scene.phases[:-1])]
+    return tuple(bound(*row) for row in zip(traced, scene.phases, starts_at_rest(scene), strict=True))
 
 
 @computed_at_once
 def _bounds_of_numbers(scene: Scene, traced: tuple[TracedPhase, ...]) -> tuple[MarginBound, ...]:
-    starts_at_rest = _starts_at_rest(scene)
 
     def bound(path, phase, from_rest):
         if int(path.dynamics.status) != Status.OK:
@@ -135,7 +128,7 @@ def _bounds_of_numbers(scene: Scene, traced: tuple[TracedPhase, ...]) -> tuple[M
         statics, accelerations = statics_at_start(scene, phase, path)
         return MarginBound(jnp.asarray(statics.best(accelerations).margin), path.dynamics.breakpoints[0], jnp.zeros(()))
 
-    return tuple(bound(*row) for row in zip(traced, scene.phases, starts_at_rest, strict=True))
+    return tuple(bound(*row) for row in zip(traced, scene.phases, starts_at_rest(scene), strict=True))
 
 
 def require_knots(knots: int) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from wholearm_jax.core import CachedJit, Status
-from wholearm_jax.dynamics import evaluate, locate_panel
 from wholearm_jax.margin import best_quasistatic_torque
 from wholearm_jax.model import (
     ContactFormation,
@@ -21,7 +20,7 @@ from wholearm_jax.model import (
     path_target,
     rigid_body,
 )
-from wholearm_jax.phases import trace_phase
+from wholearm_jax.phases import configuration, trace_phase
 from wholearm_jax.planning.path_choices import path_choices
 from wholearm_jax.planning.successors import MIN_PATH_LENGTH, touching_contacts
 from wholearm_jax.tracing import Resolution
@@ -116,12 +115,9 @@ def _trace_moves(body, hand, gravity, formations, targets, z) -> _Paths:
         s = dynamics.breakpoints[0] + dynamics.length * jnp.linspace(0.0, 1.0, PLACES)
         segment = (s[:, None] >= dynamics.breakpoints[1:-1]).sum(1).clip(0, dynamics.count - 1)
 
-        def place(segment, s):
-            panel, xi = locate_panel(dynamics, segment, s)
-            return evaluate(dynamics.configuration, panel, xi)
-
+        places = jax.vmap(configuration, (None, 0, 0))(dynamics, segment, s)
         margins = jax.vmap(lambda s: best_quasistatic_torque(dynamics, s).margin)(s)
         reason, contact = traced.path.end_reason, traced.path.end_contact
-        return _Paths(dynamics.status, dynamics.length, jax.vmap(place)(segment, s), margins, reason, contact)
+        return _Paths(dynamics.status, dynamics.length, places, margins, reason, contact)
 
     return jax.lax.map(one, (formations, targets))
