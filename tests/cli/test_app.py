@@ -16,6 +16,8 @@ from wholearm_jax.files.scene_toml import bundled, to_dict
 from wholearm_jax.model.schedule import TorqueSchedule, torque_schedule
 from wholearm_jax.phases.plan_simulation import simulate
 
+CHECK = ("--optimise", "--out=x.zarr", "--count", 2)
+
 
 @pytest.fixture
 def zero(tmp_path):
@@ -218,6 +220,13 @@ def test_robust_knows_no_holds(wholearm, scene_file):
         (("optimise",), "'scene'"),
         (("optimize", "heptagon"), "'optimize'"),
         (("scenes", "--all"), "--all"),
+        (("optimise", "heptagon", "--robust", "mass=5%", "--robust", "mass=1%"), "mass=5%, mass=1%: mass stands twice"),
+        (("plan", "heptagon", "--goal", "x=0.01,x=0.02"), "--goal x=0.01,x=0.02: x stands twice"),
+        (("plan", "heptagon", "--by", "phi=-1", "--tolerance", "phi=0"), "tolerances positive"),
+        (("check", "heptagon", *CHECK, "--vary", "friction=20"), "a percentage is written 20%"),
+        (("check", "heptagon", "--torque", __file__, "--polygons", __file__, "--out", "x.zarr"), "missing column"),
+        (("check", "heptagon", "--optimise", "--polygons", __file__, "--out", "x.zarr"), "file of numbers"),
+        (("check", "heptagon", *CHECK[2:], "--optimise", "--vary", "mass=1%", "--out", __file__), "is not a store"),
     ],
 )
 def test_wrong_arguments_are_one_line(arguments, cause, wholearm):

@@ -116,6 +116,27 @@ def test_neither_texts_nor_lengths_nor_a_turn_are_doubted(data):
         parse(data)
 
 
+DOUBTFUL_UNITS = [
+    (("object", "vertices"), [[0, 0], [80, 0], [40, 60]], "object.vertices: the object is 80 m wide, the fingers are"),
+    (("gravity",), -9.81, "gravity: -9.81 points up"),
+]
+
+
+@pytest.mark.parametrize(("place", "value", "doubt"), DOUBTFUL_UNITS, ids=["millimetres", "a sign"])
+def test_other_units_are_noted(place, value, doubt, data):
+    *outer, last = place
+    table = data
+    for key in outer:
+        table = table[key]
+    table[last] = value
+    for phase in data["phase"]:
+        phase["contacts"] = ["palm:v0", "palm:v1", "finger1:v1", "finger2:v2"]
+    with pytest.warns(DoubtfulInput) as caught:
+        parse(data, "mine")
+    (message,) = (str(one.message) for one in caught)
+    assert message.startswith(f"mine: {doubt}")
+
+
 @pytest.mark.filterwarnings("default")
 def test_the_case_in_degrees_is_noted(wholearm, request):
     path = request.path.parents[1] / "data" / "cases" / "degrees.toml"

@@ -309,6 +309,13 @@ def refused(path):
     return str(caught.value)
 
 
+def test_a_byte_order_mark_is_read(tmp_path):
+    path = tmp_path / "scene.toml"
+    save(load("heptagon"), path)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert to_dict(load(path)) == to_dict(load("heptagon"))
+
+
 def test_not_toml(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text("title = \n")

@@ -101,6 +101,7 @@ ONCE = {
     "trailing separators below the header": "t;tau1;tau2\n0;1;2;\n0.5;3;4;\n",
     "blank lines": "\n  \nt,tau1,tau2\n\n0,1,2\n   \n0.5,3,4\n,,\n\t\n\n",
     "an index": ",t,tau1,tau2\n0,0,1,2\n1,0.5,3,4\n",
+    "comments below": "t,tau1,tau2\n0,1,2\n# half way\n0.5,3,4\n# made elsewhere\n",
     "carriage returns alone": "t,tau1,tau2\r0,1,2\r0.5,3,4\r",
 }
 
@@ -115,6 +116,22 @@ def test_tables_that_can_be_read_in_one_way(text, encoding, tmp_path):
     schedule = read_torque(path)
     np.testing.assert_array_equal(schedule.times, [0, 0.5])
     np.testing.assert_allclose(schedule.values, [[1, 2], [3, 4]], rtol=1e-15)
+
+
+def test_a_minus_of_typesetting_and_a_code_page_are_read(tmp_path):
+    path = tmp_path / "torque.csv"
+    path.write_bytes("t [s],tau1 [N\u00b7m],tau2 [N\u00b7m]\n0,1,-2\n0.5,3,-4\n".encode("cp1252"))
+    expected = read_torque(path).values
+    path.write_text("t,tau1,tau2\n0,1,\u22122\n0.5,3,\u22124\n", encoding="utf-8")
+    np.testing.assert_array_equal(read_torque(path).values, expected)
+    np.testing.assert_array_equal(expected, [[1, -2], [3, -4]])
+
+
+def test_wide_characters_without_a_mark_are_refused(tmp_path):
+    path = tmp_path / "torque.csv"
+    path.write_bytes("t,tau1,tau2\n0,1,2\n1,3,4\n".encode("utf-16-le"))
+    with pytest.raises(SceneError, match="cannot be read: not text in UTF-8"):
+        read_torque(path)
 
 
 REFUSED = {

@@ -59,7 +59,30 @@ def test_too_few_knots_are_named_with_a_number_that_works(heptagon):
 def test_another_schedule_is_advised_to_be_optimised(heptagon):
     still = wa.simulate(heptagon, wa.torque_schedule([0.0, 2.0], [[0.0, 0.0], [0.0, 0.0]]))
     for phase in explain(still).phases:
-        assert phase.remedy.endswith("`wholearm optimise` looks for torques that do")
+        assert phase.remedy.endswith("`wholearm optimise` looks for torques that work")
+
+
+STILL = (0, {"toward": "phi-"}, "phi, which `toward` names, stands still", "name one that moves: x, theta1, theta2")
+WEDGED = (1, {}, "wedge the object", "lower the friction")
+
+
+@pytest.mark.parametrize(("number", "change", "cause", "remedy"), [STILL, WEDGED], ids=["still", "wedged"])
+def test_what_is_singular_is_said(number, change, cause, remedy, heptagon):
+    data = to_dict(heptagon)
+    data["phase"][number] |= change
+    data["object"]["friction"] = 0.9
+    result = wa.simulate(wa.parse(data), wa.torque_schedule([0.0, 2.0], [[0.1, -0.1], [0.1, -0.1]]))
+    phase = explain(result).phases[number]
+    assert phase.status is wa.Status.SINGULAR
+    assert cause in phase.detail
+    assert remedy in phase.remedy
+
+
+def test_a_duration_beyond_numbers_is_too_short(heptagon):
+    torque = wa.torque_schedule([0.0, 2.0], [[0.5, -0.4], [0.4, -0.3]])
+    phase = explain(wa.simulate(with_duration(heptagon, 0, 1e-300), torque)).phases[0]
+    assert "faster than the torques allow" in phase.detail
+    assert "--set 0.duration=0.0" in phase.remedy
 
 
 def test_where_the_bound_is_negative_no_more_time_is_advised():
@@ -92,6 +115,9 @@ def test_each_cause_has_its_own_words(too_fast):
     assert "however long" in detail
     assert "torque limits" in remedy
     assert "--set 2.duration=1.4" in advice._explain_motion(2, phase, 0.9, search)[1]
+    assert "`arrive = \"rest\"` in phase 'a'" in advice._explain_motion(1, phase, 0.1, search, "a")[1]
+    stiff = replace(phase, status=wa.Status.MAX_STEPS)
+    assert advice._explain_motion(0, stiff, 0.1, search)[1] is None
     assert "--rate-limit" in advice._explain_motion(0, phase, 0.1, Search(KNOTS, limits_rates=True))[1]
     for value, rounded in ((0.0931, 0.094), (0.93, 0.93), (1.01, 1.1), (123.0, 130.0)):
         assert advice.round_up_digits(value) == pytest.approx(rounded, rel=1e-12)

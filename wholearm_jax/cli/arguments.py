@@ -107,13 +107,22 @@ def phase_number(scene, phase: str) -> int | None:
     return names.index(phase) if phase in names else int(phase) if numbered else None
 
 
+def refuse_twice(source: str, names: list[str]) -> None:
+    """Raise `BadInput` where a name stands twice; `source` is what the error names."""
+    twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+    if twice is not None:
+        raise BadInput(f"{source}: {twice} stands twice")
+
+
 def parse_ensemble(scene, amounts: list[str] | None, seed: int):
     """Make the ensemble that `QUANTITY=AMOUNT` arguments describe."""
     from wholearm_jax.ensembles import make_ensemble
 
     pairs = [text.partition("=") for text in amounts or ()]
+    names = [name.strip() for name, _, _ in pairs]
+    refuse_twice(", ".join(amounts or ()), names)
     try:
-        return make_ensemble(scene, {name.strip(): amount.strip() for name, _, amount in pairs}, seed=seed)
+        return make_ensemble(scene, {name: pair[2].strip() for name, pair in zip(names, pairs, strict=True)}, seed=seed)
     except ValueError as error:
         raise BadInput(f"{error}") from None
 

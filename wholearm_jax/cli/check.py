@@ -23,7 +23,7 @@ from wholearm_jax.cli.arguments import (
     parse_ensemble,
     refuse_unwritable,
 )
-from wholearm_jax.cli.prediction import note_doubtful_schedule
+from wholearm_jax.cli.prediction import note_doubtful_schedule, refuse_short
 from wholearm_jax.cli.processes import ProcessRank, join_processes, use_all_processors
 from wholearm_jax.cli.progress import count_progress
 from wholearm_jax.core import configure
@@ -103,13 +103,9 @@ def _load_moving(name: str):
 def _read_schedule(scene, torque: Path, rank: ProcessRank):
     """Read the schedule that all scenes follow."""
     from wholearm_jax.files import read_torque
-    from wholearm_jax.phases import require_covered
 
     schedule = read_torque(torque)
-    try:
-        require_covered(scene, schedule)
-    except ValueError as error:
-        raise BadInput(f"{torque}: {error}") from None
+    refuse_short(scene, schedule, torque)
     if rank.is_first:
         note_doubtful_schedule(scene, schedule, torque)
     return schedule

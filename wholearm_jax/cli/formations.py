@@ -19,6 +19,7 @@ from wholearm_jax.cli.prediction import trace_or_exit
 from wholearm_jax.cli.tables import Column, print_json, print_table
 
 NEAR_TOL = 0.25  # gap at a start that is given roughly, in object radii, below which a contact may be meant
+MAX_NEAR = 4  # such contacts of a link: the formations of four contacts grow with the fourth power of their number
 LEGEND = """ends at, turn: the object's position and angle at the end, and by how much it turns
 length: of the path, in object radii; '-' and a status where none can be followed
 static, bound: the best least contact force [N] with the object at rest there, and in a phase of 1 s
@@ -51,7 +52,7 @@ def formations(
         touching, title = touching_contacts(loaded, z), "touching"
         successors = successor_formations(loaded, z, z_dot, rolling=True)
     else:
-        z, touching, title = loaded.start, touching_contacts(loaded, loaded.start, NEAR_TOL), "touching, or near"
+        z, touching, title = loaded.start, _near_contacts(loaded), "touching, or near"
         successors = successor_formations(loaded, z, rolling=True, touching=touching)
     flush = flush_sides(loaded, touching)
     overlaps = describe_overlaps(loaded, z) if loaded.phases or not successors else ()  # a rough start is projected
@@ -74,6 +75,25 @@ def formations(
         files = FileSet(None, (), ("formations",))
         with refuse_unwritable(f"--out {folder}"), replace_files(folder, files) as scratch:
             save_figure(lambda: plot_successors(loaded, z, successors), scratch, "formations")
+
+
+def _near_contacts(scene) -> list[str]:
+    """Return the contacts that may be meant at a start that is given roughly: of each link the few that are nearest."""
+    from wholearm_jax.model import LINKS
+    from wholearm_jax.planning import touching_contacts
+
+    order = touching_contacts(scene, scene.start, NEAR_TOL)
+    near = {link: [name for name in order if name.startswith(f"{link}:")] for link in LINKS}
+    tolerance = NEAR_TOL
+    while tolerance > 1e-6 and any(len(contacts) > MAX_NEAR for contacts in near.values()):  # as of a smooth outline
+        tolerance *= 0.8
+        names = touching_contacts(scene, scene.start, tolerance)
+        for link, contacts in near.items():
+            fewer = [name for name in contacts if name in names]
+            if len(contacts) > MAX_NEAR and fewer:
+                near[link] = fewer
+    nearest = {name for contacts in near.values() for name in contacts[:MAX_NEAR]}  # of equally near ones, the first
+    return [name for name in order if name in nearest]
 
 
 def _configuration(scene, traced, after: str | None):

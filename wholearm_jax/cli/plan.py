@@ -13,6 +13,7 @@ from wholearm_jax.cli.arguments import (
     make_output_folder,
     note,
     read_coordinate,
+    refuse_twice,
     refuse_unwritable,
 )
 from wholearm_jax.cli.progress import solver_progress
@@ -47,12 +48,14 @@ def plan(
 ) -> None:
     """Find phases that lead the object from a scene's start to a goal."""
     from wholearm_jax.files import load_goal, load_start
+    from wholearm_jax.planning import make_goal
     from wholearm_jax.planning import plan as find_plans
 
     loaded, folder = load_start(scene), make_output_folder(out)
     wanted = _goal(scene, load_goal(scene), goal, by, tolerance)
     limits = {"margin": margin, "count": count, "max_phases": phases, "rolling": rolling, "time_limit": time}
     try:
+        make_goal(loaded.start, **wanted)  # refused before anything is shown
         with solver_progress() as progress:
             bar = progress.add_task("plan", total=None, state="compiling")
 
@@ -130,13 +133,11 @@ def _read(text: str, option: str) -> dict[str, float]:
     """Read `x=-0.03,phi=-40 deg`."""
     from wholearm_jax.model import COORDINATES
 
-    values = {}
-    for part in text.split(","):
-        name, _, value = (piece.strip() for piece in part.partition("="))
-        if name not in COORDINATES:
-            raise BadInput(f"{option} {text}: write coordinates and values such as x=-0.03,phi=-40 deg")
-        values[name] = read_coordinate(f"{option} {text}", name, value)
-    return values
+    pairs = [[piece.strip() for piece in part.partition("=")] for part in text.split(",")]
+    if any(name not in COORDINATES for name, _, _ in pairs):
+        raise BadInput(f"{option} {text}: write coordinates and values such as x=-0.03,phi=-40 deg")
+    refuse_twice(f"{option} {text}", [name for name, _, _ in pairs])
+    return {name: read_coordinate(f"{option} {text}", name, value) for name, _, value in pairs}
 
 
 def _json_plan(one) -> dict[str, Any]:

@@ -77,15 +77,23 @@ def _note_unreached(name: str, scene, traced) -> None:
             note(f"{name}: phase[{k}].until: {until} is not on its path, which leads from {begin:.6g} to {end:.6g}")
 
 
+def refuse_short(scene, schedule, torque: Path) -> None:
+    """Raise `BadInput` for a schedule of file `torque` that is shorter than its plan, before anything is computed."""
+    from wholearm_jax.phases import require_covered
+
+    try:
+        require_covered(scene, schedule)
+    except ValueError as error:
+        raise BadInput(f"{torque}: {error}") from None
+
+
 def simulate_or_exit(scene, schedule, torque: Path, tolerance: float, traced):
     """Simulate a plan under the schedule of file `torque`. Raises `BadInput` for a schedule that is too short."""
     from wholearm_jax.phases import simulate
 
+    refuse_short(scene, schedule, torque)
     note_doubtful_schedule(scene, schedule, torque)
-    try:
-        return simulate(scene, schedule, tolerance=tolerance, traced=traced)
-    except ValueError as error:
-        raise BadInput(f"{torque}: {error}") from None
+    return simulate(scene, schedule, tolerance=tolerance, traced=traced)
 
 
 def note_doubtful_schedule(scene, schedule, torque: Path) -> None:

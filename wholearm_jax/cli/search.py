@@ -18,7 +18,7 @@ def search(scene: SceneName, out: OutputFolder = None, samples: Samples = 201, a
     loaded = load_scene(scene)
     folder = make_output_folder(out)
     from wholearm_jax.core import wait_for
-    from wholearm_jax.optimisation import certified_bounds, precompile_search, search_by_steps
+    from wholearm_jax.optimisation import certified_bounds, explain, precompile_search, search_by_steps
 
     compiled = precompile_search()
     traced = trace_or_exit(scene, loaded)
@@ -27,9 +27,10 @@ def search(scene: SceneName, out: OutputFolder = None, samples: Samples = 201, a
         optimum = search_by_steps(loaded, traced=traced)
     except ValueError as error:
         raise BadInput(f"{scene}: {error}") from None
+    result = explain(optimum.result)
     if not as_json:
-        print_phases(optimum.result)
+        print_phases(result)
         print(f"{optimum.simulations} simulations in {optimum.seconds:.2f} s")
-    values = tuple(float(b.value) for b in certified_bounds(optimum.result.scene, traced=traced))
+    values = tuple(float(b.value) for b in certified_bounds(result.scene, traced=traced))
     more = {"simulations": optimum.simulations, "seconds": optimum.seconds}
-    write_and_exit(optimum.result, folder, samples, as_json, bounds=values, command="search", **more)
+    write_and_exit(result, folder, samples, as_json, bounds=values, command="search", **more)

@@ -16,7 +16,7 @@ from wholearm_jax.cli.arguments import (
     make_output_folder,
 )
 from wholearm_jax.cli.output import print_phases, write_and_exit
-from wholearm_jax.cli.prediction import simulate_or_exit, trace_or_exit
+from wholearm_jax.cli.prediction import refuse_short, simulate_or_exit, trace_or_exit
 
 
 def simulate(
@@ -39,6 +39,7 @@ def simulate(
     from wholearm_jax.phases import precompile_simulate
 
     schedule = read_torque(torque)
+    refuse_short(loaded, schedule, torque)
     folder = make_output_folder(out)
     compiled = precompile_simulate(loaded, schedule, tolerance)
     traced = trace_or_exit(scene, loaded)

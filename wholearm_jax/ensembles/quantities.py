@@ -79,7 +79,8 @@ def parse_spread(scene: Scene, name: str, amount: float | str) -> Spread:
     spread = Spread(size, text.endswith("%"))
     problem = _find_problem(scene, name, spread)
     if problem is not None:
-        raise ValueError(f"{name}={text}: too much, {problem}")
+        percent = "" if spread.relative or size < 1 else f"; a percentage is written {text}%"
+        raise ValueError(f"{name}={text}: too much, {problem}{percent}")
     return spread
 
 

@@ -88,6 +88,8 @@ def store_metadata(count: int, chunk: int, **settings: Any) -> dict[str, Any]:
 
 def open_store(path: Path, metadata: Mapping[str, Any], torques: int = 0) -> Store:
     """Open a store to continue, or make it. Raises `StoreError` for a path that holds something else."""
+    if path.exists() and not path.is_dir():
+        raise StoreError(f"{path}: exists and is not a store")
     try:
         group = zarr.open_group(str(path), mode="r+", zarr_format=3)
     except (FileNotFoundError, GroupNotFoundError):

@@ -40,7 +40,8 @@ def read_polygons(path: Path, scene: Scene) -> SceneBatch:
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file") from None
     except _UNREADABLE as error:
-        raise SceneError(f"{path}: not a NumPy .npz file: {error}") from None
+        reason = f": {error.strerror}" if isinstance(error, OSError) and error.strerror else ""
+        raise SceneError(f"{path}: not a NumPy .npz file of numbers{reason}") from None
     for name, values in entries.items():
         if values.dtype.kind not in "fiu":
             raise SceneError(f"{path}: {name}: needs real numbers, not {values.dtype}")

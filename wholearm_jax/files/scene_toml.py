@@ -16,6 +16,7 @@ from pydantic import (
 
 from wholearm_jax.core import DoubtfulInput, SceneError, as_device_array, write_atomically
 from wholearm_jax.files.angles import doubtful_angles
+from wholearm_jax.files.doubtful_units import doubtful_units
 from wholearm_jax.files.scene_schema import FingerTable, GoalTable, RestTable, SceneTables, explain_validation_error
 from wholearm_jax.model import (
     COORDINATES,
@@ -102,7 +103,7 @@ def _read_toml(name: str | Path) -> dict[str, Any]:
         return tomllib.loads(text)
     path = Path(name)
     try:
-        data = tomllib.loads(path.read_text("utf-8"))
+        data = tomllib.loads(path.read_text("utf-8-sig"))
     except FileNotFoundError:
         near = difflib.get_close_matches(str(name), bundled(), 1)
         hint = f"; did you mean the bundled scene '{near[0]}'?" if near else f"; bundled scenes: {', '.join(bundled())}"
@@ -122,8 +123,8 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
         source: Name of the scene, with which messages begin.
 
     Raises:
-        SceneError: With one line that names the key and what is wrong. A number that may be meant as degrees gives a
-            `DoubtfulInput` warning.
+        SceneError: With one line that names the key and what is wrong. Numbers that may be meant in other units
+            (degrees, millimetres) give a `DoubtfulInput` warning.
 
     >>> from wholearm_jax.files.scene_toml import to_dict
     >>> data = to_dict(wa.load("heptagon"))
@@ -146,7 +147,7 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
         checked = SceneTables.model_validate(data)
     except ValidationError as error:
         raise SceneError(f"{source}: {explain_validation_error(error)}") from None
-    for doubt in doubtful_angles(data):
+    for doubt in (*doubtful_angles(data), *doubtful_units(checked)):
         warnings.warn(f"{source}: {doubt}", DoubtfulInput, stacklevel=2)
     scene = _build(checked)
     if rest is None:

@@ -1,7 +1,8 @@
 """Torque schedules from CSV files, also of spreadsheets and other programs, where they can be read in one way only.
 
 Separators may be commas, semicolons, tabs, bars or spaces; decimals may be commas where the separator is not. Units in
-the header, a byte-order mark, blank lines and trailing separators are read. What could mean two things is refused.
+the header, a byte-order mark, blank lines, comments (`#`) and trailing separators are read. What could mean two things
+is refused.
 """
 
 import csv
@@ -69,20 +70,29 @@ def read_torque(path: str | Path) -> TorqueSchedule:
 
 
 def _read_text(path: str | Path) -> str:
-    """Read a file as UTF-8, or as the UTF-16 that spreadsheets write as "Unicode text"."""
+    """Read a file as UTF-8, as the UTF-16 that spreadsheets write as "Unicode text", or in Windows' code page.
+
+    In a code page only words and units of the header can be misread, which the columns' names then show.
+    """
     try:
         content = Path(path).read_bytes()
+        if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+            return _plain(content.decode("utf-16"))
         try:
-            return content.decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            text = content.decode("utf-16") if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ""
-            if not text.isascii() or not text:
-                raise error from None
-            return text
+            return _plain(content.decode("utf-8-sig"))
+        except UnicodeDecodeError:
+            return _plain(content.decode("cp1252"))
     except FileNotFoundError:
         raise ValueError("no such file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def _plain(text: str) -> str:
+    """Return a text as it is. Raises ValueError for one that another encoding has made of something else."""
+    if "\0" in text or (text.strip() and not re.search("[ -~]", text)):
+        raise ValueError("cannot be read: not text in UTF-8")
+    return text
 
 
 def _read_table(text: str) -> _Table:
@@ -115,7 +125,7 @@ def _read_table(text: str) -> _Table:
     places = [names.index(name) for name in TORQUE_COLUMNS]
     factors = [_factor(*parsed[place], number + 1) for place in places]
     body = _split(lines[number + 1 :], separator)
-    rows = [(number + 2 + k, cells) for k, cells in enumerate(body) if any(cell.strip() for cell in cells)]
+    rows = [(number + 2 + k, cells) for k, cells in enumerate(body) if _count(cells) and cells[0].lstrip()[:1] != "#"]
     return _Table(separator, header, rows, places, factors, len(lines))
 
 
@@ -192,7 +202,7 @@ def _read_numbers(table: _Table) -> list[list[float]]:
 def _number(text: str) -> float:
     if "_" in text:  # which Python allows between digits
         raise ValueError
-    return float(text)
+    return float(text.replace("\u2212", "-"))  # the minus sign of typesetting
 
 
 def _other_separator(table: _Table, cells: list[str]) -> str:

@@ -20,11 +20,12 @@ from wholearm_jax.margin import MarginBound, affine_coefficients, best_quasistat
 from wholearm_jax.model import Arrival
 from wholearm_jax.optimisation.best_motion import shortest_motions
 from wholearm_jax.optimisation.quasistatic_plan import bounds
+from wholearm_jax.optimisation.singular_advice import explain_singular
 from wholearm_jax.phases import PhaseResult, Result, TracedPhase, configuration
 
 REMEDY_BOUND = "lower the friction or raise the torque limits, turn the object another way, or choose other contacts"
 REMEDY_LIMITS = "raise the torque limits, lower the friction, or choose other contacts"
-REMEDY_OPTIMISE = "`wholearm optimise` looks for torques that do"
+REMEDY_OPTIMISE = "`wholearm optimise` looks for torques that work"
 SPARE_TIME = 1.5  # a phase should have this much more time than its fastest motion takes
 MIN_KNOTS = 11  # fewer are too few for most phases
 
@@ -56,12 +57,14 @@ def explain(
         The same result with `detail` and `remedy` of phases that fail on the way; others are as they were.
     """
     traced = tuple(phase.traced for phase in result.phases)
+    result = _explain_singular_phases(result)
     failed = [k for k, phase in enumerate(result.phases) if _fails_on_its_way(phase)]
     if not failed and not too_short:
         return result
     values = margin_bounds or bounds(result.scene, traced=traced)
     searched = [k for k in failed if k not in too_short]
-    open_ones = [k for k in searched if float(values[k].value) > 0 and result.phases[k].arrive is not Arrival.HOLD]
+    refused = [k for k in searched if _no_torque_holds(result.phases[k], float(values[k].value))]
+    open_ones = [k for k in searched if k not in refused and result.phases[k].arrive is not Arrival.HOLD]
     fastest = shortest_motions(result.scene, 0.0, traced=traced) if open_ones else (None,) * len(traced)
     phases = list(result.phases)
     for k, shortest in too_short.items():
@@ -69,11 +72,23 @@ def explain(
         phases[k] = replace(phases[k], status=Status.TOO_SHORT, contact=None, slips=False, detail=detail, remedy=remedy)
     for k in searched:
         motion = fastest[k]
-        if float(values[k].value) <= 0:
+        if k in refused:
             phases[k] = _explain_negative_bound(phases[k], values[k], traced[k])
         elif motion is not None:
-            detail, remedy = _explain_motion(k, phases[k], motion.duration, search)
+            at_speed = [j for j in (k - 1, k) if j >= 0 and phases[j].arrive is Arrival.MOVING]
+            stop = phases[at_speed[0]].name if at_speed else None
+            detail, remedy = _explain_motion(k, phases[k], motion.duration, search, stop)
             phases[k] = replace(phases[k], detail=detail or phases[k].detail, remedy=remedy)
+    return replace(result, phases=tuple(phases))
+
+
+def _explain_singular_phases(result: Result) -> Result:
+    """Say of each phase that is `singular` which of the causes it is."""
+    phases = list(result.phases)
+    for k, phase in enumerate(result.phases):
+        if phase.status is Status.SINGULAR:
+            detail, remedy = explain_singular(result.scene, result.scene.phases[k], phase.traced)
+            phases[k] = replace(phase, detail=detail, remedy=remedy)
     return replace(result, phases=tuple(phases))
 
 
@@ -83,10 +98,18 @@ def _fails_on_its_way(phase: PhaseResult) -> bool:
     return has_path and phase.status not in (Status.OK, Status.OBSTACLE)
 
 
-def _explain_motion(number: int, phase: PhaseResult, fastest: float, search: Search | None) -> tuple[str | None, str]:
+def _no_torque_holds(phase: PhaseResult, bound: float) -> bool:
+    """Whether a bound says that no torque holds a phase; a duration beyond what can be computed leaves none (-inf)."""
+    return bound <= 0 and (math.isfinite(bound) or phase.arrive is Arrival.HOLD)
+
+
+def _explain_motion(
+    number: int, phase: PhaseResult, fastest: float, search: Search | None, stop: str | None = None
+) -> tuple[str | None, str | None]:
     """Return cause and remedy of a phase that torques could hold at rest anywhere; `fastest` [s] is its fastest motion.
 
     The fastest motion presses every contact and stays within the torque limits; it is infinite where there is none.
+    `stop` names the phase whose end the object passes at speed, where it does.
     """
     longer = (
         f"--set {number}.duration={round_up_digits(SPARE_TIME * fastest) if math.isfinite(fastest) else math.inf:g}"
@@ -98,11 +121,17 @@ def _explain_motion(number: int, phase: PhaseResult, fastest: float, search: Sea
         return detail, f"give it more time ({longer})"
     if search is None:
         return phase.detail, f"{_first_half(phase)}; {REMEDY_OPTIMISE}"
+    if phase.status is Status.MAX_STEPS:
+        return phase.detail, None
     possible = f"a motion of {fastest:.3g} s or longer exists"
     if SPARE_TIME * fastest > phase.duration:
         return f"{possible}, which leaves little spare time in {phase.duration:.3g} s", f"give it more time ({longer})"
     if search.limits_rates:
         return f"{possible} where torques may jump", f"allow faster torques (--rate-limit) or more time ({longer})"
+    if stop is not None:
+        return f"{possible}, but at speed no torques led to it", (
+            f"stop before the change of formation (`arrive = \"rest\"` in phase '{stop}'), or try another --passing"
+        )
     return f"{possible}, but {search.knots} knots did not lead to it", (
         f"take more knots (--knots {max(MIN_KNOTS, 2 * search.knots)})"
     )
@@ -121,7 +150,7 @@ def round_up_digits(value: float, significant: int = 2) -> float:
 
 def _explain_negative_bound(phase: PhaseResult, bound: MarginBound, traced: TracedPhase) -> PhaseResult:
     """Say where a phase's bound is negative, and what would pull."""
-    if phase.arrive is Arrival.HOLD or not np.isfinite(float(bound.value)):
+    if phase.arrive is Arrival.HOLD:
         detail = f"no torque holds the object there: the bound is {float(bound.value):.3g} N"
         return replace(phase, detail=detail, remedy=REMEDY_BOUND)
     return replace(phase, detail=_negative_bound(phase, bound, traced), remedy=REMEDY_BOUND)

@@ -147,6 +147,7 @@ def optimise(
     """
     require_x64(scene)
     require_knots(knots)
+    rate_limit = None if rate_limit == np.inf else rate_limit
     require_positive(steps=steps, tolerance=tolerance, rate_limit=np.inf if rate_limit is None else rate_limit)
     if margin is not None and (durations is not None or not margin >= 0):
         raise ValueError("margin is a number of at least 0, and excludes durations")

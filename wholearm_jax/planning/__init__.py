@@ -1,5 +1,6 @@
 """Which contact formation can come next, and which lead to a goal."""
 
+from wholearm_jax.planning.goal import make_goal
 from wholearm_jax.planning.hand_search import HandSearchResult, HandTrial, plan_with_hand
 from wholearm_jax.planning.plans import Plan, PlanningResult
 from wholearm_jax.planning.search import plan
@@ -19,6 +20,7 @@ __all__ = [
     "Successor",
     "exit_velocity",
     "flush_sides",
+    "make_goal",
     "plan",
     "plan_with_hand",
     "successor_formations",
