@@ -49,12 +49,14 @@ class CachedJit:
     """A function compiled once for every kind of arguments: arrays are data, all other leaves are settings.
 
     It does what `equinox.filter_jit` does, with a quarter of its overhead for each call, and looks in the folder of
-    `enable_program_cache` for programs that earlier processes have traced.
+    `enable_program_cache` for programs that earlier processes have traced. `compiler_options` are XLA's, for programs
+    that are compiled on their own.
     """
 
-    def __init__(self, function: Callable) -> None:
+    def __init__(self, function: Callable, *, compiler_options: dict[str, Any] | None = None) -> None:
         functools.update_wrapper(self, function)
         self._function, self._name = function, function.__qualname__
+        self._compiler_options = compiler_options
         self._programs: dict[Any, Callable] = {}
 
     def __call__(self, *args):
@@ -68,13 +70,15 @@ class CachedJit:
         program = self._programs.get(key)
         if program is None:
             lowered = self._read_or_export(folder, arrays, tree, settings) if folder else None
-            program = jax.jit(self._of_arrays(tree, settings))
+            program = jax.jit(
+                self._of_arrays(tree, settings), compiler_options=None if traced else self._compiler_options
+            )
             if not (traced or lowered):
                 with _garbage_collection_paused():
                     program.trace(*arrays).lower()  # all that needs Python; the first call compiles it
             if not traced:
                 start_queued()
-            program = self._programs[key] = _compile(*lowered) if lowered else program
+            program = self._programs[key] = _compile(*lowered, self._compiler_options) if lowered else program
         return program(*arrays)
 
     def compiled_count(self) -> int:
@@ -160,8 +164,9 @@ def _lower(program: export.Exported, structure):
     return jax.jit(program.call).lower(*program.in_avals), structure
 
 
-def _compile(lowered, structure) -> Callable:
-    compiled = lowered.compile()  # ahead of time: `jit` would compile again where a constant's type is weak
+def _compile(lowered, structure, compiler_options) -> Callable:
+    # Ahead of time: `jit` would compile again where a constant's type is weak.
+    compiled = lowered.compile(compiler_options=compiler_options)
     return lambda *arrays: jax.tree.unflatten(structure, compiled(*arrays))
 
 

@@ -138,11 +138,12 @@ def round_up(rows: int, multiple: int = ROW_MULTIPLE) -> int:
 
 @partial(jax.jit, static_argnames="multiple")
 def pad_schedule(schedule: TorqueSchedule, multiple: int = ROW_MULTIPLE) -> TorqueSchedule:
-    """Pad a schedule with rows after its end that repeat the last torque."""
-    missing = round_up(schedule.times.shape[0], multiple) - schedule.times.shape[0]
-    ramp = schedule.times[-1] + (schedule.times[-1] - schedule.times[0]) * jnp.arange(1, missing + 1)
-    rows = jnp.broadcast_to(schedule.values[-1], (missing, 2))
-    return TorqueSchedule(jnp.concatenate([schedule.times, ramp]), jnp.concatenate([schedule.values, rows]))
+    """Pad a schedule, or several along leading axes, with rows after its end that repeat the last torque."""
+    times, values = schedule.times, schedule.values
+    missing = round_up(times.shape[-1], multiple) - times.shape[-1]
+    ramp = times[..., -1:] + (times[..., -1:] - times[..., :1]) * np.arange(1, missing + 1, dtype=times.dtype)
+    rows = jnp.repeat(values[..., -1:, :], missing, axis=-2)
+    return TorqueSchedule(jnp.concatenate([times, ramp], -1), jnp.concatenate([values, rows], -2))
 
 
 def restrict_to_phase(schedule: TorqueSchedule, start: Float[Array, ""], duration: Float[Array, ""]) -> PhaseSchedule:

@@ -1,12 +1,16 @@
 """Compressive margin of a plan as one differentiable number."""
 
 from dataclasses import replace
+from functools import partial
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from wholearm_jax.core import is_traced
 from wholearm_jax.model import Arrival, Scene, TorqueSchedule
+from wholearm_jax.phases.margin_gradient import margin_and_gradient
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.plan_schedule import has_torque_jumps, require_followable, with_plan_step_capacity
 from wholearm_jax.phases.plan_simulation import simulate_phases
@@ -56,9 +60,30 @@ def margin(
     options = replace(with_plan_step_capacity(options, scene, torque), has_jumps=jumps)
     if torque.times.dtype == jnp.float32:
         options = _coarsen(options)
+    # Where the inputs are numbers and only the margin is differentiated, other programs give the derivative.
+    compute = _margin if options.adjoint is Adjoint.BOTH else _margin_in_programs
+    return compute(scene, torque, options=options, resolution=resolution)
+
+
+def _margin_in_programs(scene: Scene, torque: TorqueSchedule, *, options: IntegratorOptions, resolution: Resolution):
+    """Trace and simulate the plan."""
     traced = trace(scene, resolution=resolution)
     value = plan_margin(scene, simulate_phases(scene, torque, traced, options))
     return refuse_coarse_tables(value, traced, resolution) if is_traced(scene) else value
+
+
+_margin = eqx.filter_custom_jvp(_margin_in_programs)
+
+
+@_margin.def_jvp
+def _slope(inputs, tangents, *, options: IntegratorOptions, resolution: Resolution):
+    """Compute the margin and its slope along `tangents`, which are None where there are none."""
+    if is_traced(inputs):
+        return eqx.filter_jvp(partial(_margin_in_programs, options=options, resolution=resolution), inputs, tangents)
+    with jax.core.eval_context():  # of numbers, as outside of the derivative: programs are shared
+        value, gradient = margin_and_gradient(inputs, tangents, options, resolution)
+    along = jax.tree.map(lambda slope, tangent: (slope * tangent).sum(), gradient, tangents)
+    return value, sum(jax.tree.leaves(along))
 
 
 def _coarsen(options: IntegratorOptions) -> IntegratorOptions:

@@ -119,7 +119,7 @@ def simulate_phases(
         stacked = stack_trees([(path.dynamics, *phase_inputs(phase)) for path, phase in phases])
         dtype = torque.times.dtype
         options = tolerance_as_data(options, dtype)
-        simulated = _simulate_in_one_program(stacked, schedule, options, jnp.asarray(arrival, dtype))
+        simulated = simulate_in_one_program(stacked, schedule, options, jnp.asarray(arrival, dtype))
         return unstack_trees(simulated, len(traced))
     carry, simulated_phases = initial_carry(torque), []
     for path, phase in phases:
@@ -129,7 +129,7 @@ def simulate_phases(
 
 
 @eqx.filter_jit
-def _simulate_in_one_program(phases, schedule: TorqueSchedule, options: IntegratorOptions, arrival) -> SimulatedPhase:
+def simulate_in_one_program(phases, schedule: TorqueSchedule, options: IntegratorOptions, arrival) -> SimulatedPhase:
     """Simulate every phase of a plan in one program: a `SimulatedPhase` with a leading axis of phases."""
     return jax.lax.scan(partial(scan_step, schedule, options, arrival), initial_carry(schedule), phases)[1]
 

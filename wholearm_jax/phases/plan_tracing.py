@@ -59,20 +59,29 @@ def _trace_transformed(scene: Scene, resolution: Resolution, tolerance: float) -
     Its sizes grow as in `_trace_refined` where its numbers are known, as under `grad`; within `jit` and `vmap` they are
     as given.
     """
+    traced = refine_in_one_program(lambda sizes: trace_in_one_program(scene, sizes), resolution, tolerance)
+    return unstack_trees(traced, len(scene.phases))
+
+
+def refine_in_one_program(trace_stacked, resolution: Resolution, tolerance: float = TABLE_TOL):
+    """Call `trace_stacked(resolution)` with larger sizes until they suffice, and return its result.
+
+    Its result has stacked path dynamics as `dynamics`, which do not converge where the largest sizes do not suffice.
+    Sizes that are being transformed are not judged.
+    """
     while True:
-        traced = trace_in_one_program(scene, resolution)
+        traced = trace_stacked(resolution)
         sizes = jax.lax.stop_gradient(_table_sizes(traced.dynamics))
         if is_traced(sizes):
-            break
+            return traced
         full, coarse = map(np.asarray, insufficient(jax.device_get(sizes), resolution, tolerance))
         refined = _refine(resolution, bool(full.any()), bool(coarse.any()))
         if refined is None:
             status = np.where(full | coarse, int(Status.NO_CONVERGENCE), sizes.status)
-            traced = eqx.tree_at(lambda t: t.dynamics.status, traced, as_device_array(status))
-        if refined in (None, resolution):
-            break
+            return eqx.tree_at(lambda t: t.dynamics.status, traced, as_device_array(status))
+        if refined == resolution:
+            return traced
         resolution = refined
-    return unstack_trees(traced, len(scene.phases))
 
 
 class TableSizes(NamedTuple):
