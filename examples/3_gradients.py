@@ -9,7 +9,7 @@ wa.configure()
 scene = wa.load("heptagon")
 torque = wa.quasistatic(scene)
 
-slope = eqx.filter_grad(wa.margin)(scene, torque)  # a scene that holds the derivatives; compiles for most of a minute
+slope = eqx.filter_grad(wa.margin)(scene, torque)  # a scene that holds the derivatives; compiles once, some 20 s
 print("d margin / d friction, by link [N]:", slope.object.friction)
 print("d margin / d vertex [N/m]:")
 print(slope.object.vertices[: int(scene.object.count)])

@@ -70,9 +70,8 @@ class CachedJit:
         program = self._programs.get(key)
         if program is None:
             lowered = self._read_or_export(folder, arrays, tree, settings) if folder else None
-            program = jax.jit(
-                self._of_arrays(tree, settings), compiler_options=None if traced else self._compiler_options
-            )
+            compiler_options = None if traced else self._compiler_options
+            program = jax.jit(self._of_arrays(tree, settings), compiler_options=compiler_options)
             if not (traced or lowered):
                 with _garbage_collection_paused():
                     program.trace(*arrays).lower()  # all that needs Python; the first call compiles it

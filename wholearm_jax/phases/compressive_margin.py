@@ -6,6 +6,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import eval_context
 from jaxtyping import Array, Float
 
 from wholearm_jax.core import is_traced
@@ -80,7 +81,7 @@ def _slope(inputs, tangents, *, options: IntegratorOptions, resolution: Resoluti
     """Compute the margin and its slope along `tangents`, which are None where there are none."""
     if is_traced(inputs):
         return eqx.filter_jvp(partial(_margin_in_programs, options=options, resolution=resolution), inputs, tangents)
-    with jax.core.eval_context():  # of numbers, as outside of the derivative: programs are shared
+    with eval_context():  # of numbers, as outside of the derivative: programs are shared
         value, gradient = margin_and_gradient(inputs, tangents, options, resolution)
     along = jax.tree.map(lambda slope, tangent: (slope * tangent).sum(), gradient, tangents)
     return value, sum(jax.tree.leaves(along))

@@ -150,9 +150,8 @@ def _unit_directions(inputs, chosen: list[bool]) -> Iterator[Any]:
         blocks = []
         for leaf, begin, size in zip(leaves, begins, sizes, strict=True):
             place = (first + row == begin + np.arange(size)).astype(leaf.dtype) if size else 0.0
-            is_float = eqx.is_inexact_array(leaf)
-            block = np.zeros((DIRECTIONS, leaf.size), leaf.dtype) + place if is_float else None
-            blocks.append(block.reshape(DIRECTIONS, *leaf.shape) if is_float else None)
+            block = (np.zeros((DIRECTIONS, leaf.size), leaf.dtype) + place).reshape(DIRECTIONS, *leaf.shape)
+            blocks.append(block if eqx.is_inexact_array(leaf) else None)
         yield jax.tree.unflatten(structure, blocks)
 
 
