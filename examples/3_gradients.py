@@ -3,19 +3,24 @@
 import equinox as eqx
 
 import wholearm_jax as wa
-from wholearm_jax.phases.gradients import torque_gradient
 
 wa.configure()
 scene = wa.load("heptagon")
 torque = wa.quasistatic(scene)
 
-slope = eqx.filter_grad(wa.margin)(scene, torque)  # a scene that holds the derivatives; compiles once, some 20 s
+
+def margin(inputs):
+    """Return the margin of a scene and a schedule."""
+    return wa.margin(*inputs)
+
+
+# A scene and a schedule that hold the derivatives; compiles once, some 20 s.
+value, (slope, torque_slope) = eqx.filter_value_and_grad(margin)((scene, torque))
 print("d margin / d friction, by link [N]:", slope.object.friction)
 print("d margin / d vertex [N/m]:")
 print(slope.object.vertices[: int(scene.object.count)])
 
-margin, torque_slope = torque_gradient(scene, torque)  # with respect to torques alone: forward or reverse mode
-print(f"margin {float(margin):.4f} N")
-rate = 1e-3 / float((torque_slope**2).sum())
-better = wa.torque_schedule(torque.times, torque.values + rate * torque_slope)
-print(f"after a small step along the gradient {float(torque_gradient(scene, better)[0]):.4f} N")
+print(f"margin {float(value):.4f} N")
+rate = 1e-3 / float((torque_slope.values**2).sum())
+better = wa.torque_schedule(torque.times, torque.values + rate * torque_slope.values)
+print(f"after a small step along the gradient {float(wa.margin(scene, better)):.4f} N")
