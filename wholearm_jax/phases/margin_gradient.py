@@ -26,7 +26,7 @@ from wholearm_jax.phases.plan_tracing import refine_in_one_program, trace_in_one
 from wholearm_jax.simulation import Adjoint, IntegratorOptions, tolerance_as_data
 from wholearm_jax.tracing import Resolution
 
-DIRECTIONS_AT_A_TIME = 64  # that a program takes at a time
+DIRECTION_BATCH = 64  # that a program takes at a time
 COMPILED_SOONER = {"xla_backend_optimization_level": 0}  # half the time to compile, and twice to run
 
 
@@ -135,7 +135,7 @@ def _placeholders(resolution: Resolution, phases: int) -> PathDynamics:
 def _zero_slopes(tree):
     """Return slopes of zero for every float of a tree."""
     return jax.tree.map(
-        lambda a: np.zeros((DIRECTIONS_AT_A_TIME, *a.shape), a.dtype), eqx.filter(tree, eqx.is_inexact_array)
+        lambda a: np.zeros((DIRECTION_BATCH, *a.shape), a.dtype), eqx.filter(tree, eqx.is_inexact_array)
     )
 
 
@@ -147,14 +147,12 @@ def _unit_directions(inputs, chosen: list[bool]) -> Iterator[Any]:
     leaves, structure = jax.tree.flatten(inputs)
     sizes = [leaf.size if flag else 0 for leaf, flag in zip(leaves, chosen, strict=True)]
     begins = np.cumsum([0, *sizes[:-1]])
-    for first in range(0, sum(sizes), DIRECTIONS_AT_A_TIME):
-        row = np.arange(DIRECTIONS_AT_A_TIME)[:, None]
+    for first in range(0, sum(sizes), DIRECTION_BATCH):
+        row = np.arange(DIRECTION_BATCH)[:, None]
         blocks = []
         for leaf, begin, size in zip(leaves, begins, sizes, strict=True):
             place = (first + row == begin + np.arange(size)).astype(leaf.dtype) if size else 0.0
-            block = (np.zeros((DIRECTIONS_AT_A_TIME, leaf.size), leaf.dtype) + place).reshape(
-                DIRECTIONS_AT_A_TIME, *leaf.shape
-            )
+            block = (np.zeros((DIRECTION_BATCH, leaf.size), leaf.dtype) + place).reshape(DIRECTION_BATCH, *leaf.shape)
             blocks.append(block if eqx.is_inexact_array(leaf) else None)
         yield jax.tree.unflatten(structure, blocks)
 
