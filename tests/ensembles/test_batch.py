@@ -104,6 +104,13 @@ def test_a_scene_that_cannot_be_followed_disturbs_no_other(drawn, schedule, chec
         assert mixed.status[row] == checked.status[row]
 
 
+@eqx.filter_jit
+def graded(scene, torque, max_error):
+    """One scene's check in the coarse pass, torques that step: a program for all schedules."""
+    options = replace(COARSE_PASS.options, has_jumps=True)
+    return check_scene(scene, torque, ARRIVAL, COARSE_PASS._replace(options=options, max_error=max_error))
+
+
 def test_what_follows_a_failure_must_be_known_as_well(scene, schedule):
     """Its margin counts: a table that is too coarse there is refined, though the status is that of the phase before."""
     bent = jnp.where((schedule.times < 0.5)[:, None], -schedule.values, schedule.values)
@@ -111,12 +118,8 @@ def test_what_follows_a_failure_must_be_known_as_well(scene, schedule):
     errors = [float(one.dynamics.error) for one in wa.trace(scene, resolution=COARSE_PASS.resolution, tolerance=1.0)]
     assert errors[0] < errors[1]
 
-    @jax.jit
-    def checked(limit):
-        return check_scene(scene, torque, ARRIVAL, COARSE_PASS._replace(max_error=limit))
-
     for limit, enough in ((np.sqrt(errors[0] * errors[1]), False), (2 * errors[1], True)):
-        answer, grade = checked(limit)
+        answer, grade = graded(scene, torque, jnp.asarray(limit))
         assert int(answer.status) != Status.OK
         assert int(answer.phase) == 0
         assert (int(grade) == NextPass.DONE) is enough
@@ -433,13 +436,6 @@ def waiting(push, first, then):
     return wa.torque_schedule([0.0, 0.2, 0.2, 1.0, 1.0, 2.0], values)
 
 
-@eqx.filter_jit
-def graded(scene, torque):
-    """One scene's check in the coarse pass, torques that step: a program for all schedules."""
-    step = COARSE_PASS._replace(options=replace(COARSE_PASS.options, has_jumps=True))
-    return check_scene(scene, torque, ARRIVAL, step)
-
-
 @pytest.mark.parametrize("ways", [("squeeze", "squeeze"), ("open", "open"), ("squeeze", "open"), ("open", "squeeze")])
 def test_an_object_waits_only_where_some_forces_hold_it(scene, schedule, ways):
     """Fingers that open gently do not move the object as far as accelerations tell, but nothing holds it either."""
@@ -448,7 +444,7 @@ def test_an_object_waits_only_where_some_forces_hold_it(scene, schedule, ways):
     alone = wa.simulate(scene, torque, arrival=ARRIVAL)
     assert alone.phases[0].holds[0].start == 0.0, "it waits"
     assert (alone.phases[0].holds[0].loss_time is None) is held
-    _, grade = graded(scene, pad_schedule(torque))
+    _, grade = graded(scene, pad_schedule(torque), jnp.asarray(COARSE_PASS.max_error))
     assert int(grade) == (NextPass.DONE if held else NextPass.SINGLE)
     assert_as_alone(wa.check([scene], torque, arrival=ARRIVAL, tolerance=1e-10), scene, torque, 0)
 
@@ -468,6 +464,7 @@ def test_scenes_that_share_their_geometry_share_their_wires(scene):
     assert shared.breakpoints.shape == (len(scene.phases), COARSE_PASS.resolution.segments + 1)
 
 
+@pytest.mark.slow
 def test_scenes_side_by_side_as_on_a_gpu_are_what_they_are_one_after_the_other(ensemble, schedule):
     numbers, level = (
         jnp.arange(3),

@@ -100,7 +100,7 @@ def test_margins_converge_with_the_square_of_the_interval(paths):
     assert steps[-1] < steps[0]
 
 
-@pytest.mark.parametrize("fast", [False, True], ids=["margin", "time"])
+@pytest.mark.parametrize("fast", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["margin", "time"])
 def test_derivatives_are_those_of_differences(paths, fast):
     """With respect to every coefficient of the table along a random direction, and to torque limits and time."""
     dynamics = paths["heptagon", 1]

@@ -92,7 +92,7 @@ def test_a_torque_out_of_reach_is_none(change):
     [
         ("heptagon", 1.0, 2.0),
         ("hexagon", 1.0, 2.0),
-        ("tipping", 1.0, 10.0),
+        pytest.param("tipping", 1.0, 10.0, marks=pytest.mark.slow),
         ("hexagon", 0.3, 20.0),  # where rounding has the object set out just before a knot, and no step fits in
     ],
 )

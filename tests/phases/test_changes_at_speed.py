@@ -18,7 +18,7 @@ from wholearm_jax.phases import has_torque_jumps, simulate_phases
 from wholearm_jax.phases.phase_ends import start_configuration
 from wholearm_jax.simulation import Adjoint, IntegratorOptions
 
-FLIGHTS = ("flight", "passage")
+FLIGHTS = (pytest.param("flight", marks=pytest.mark.slow), "passage")
 
 
 @pytest.fixture(scope="module", params=FLIGHTS)

@@ -58,7 +58,16 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=[*CASES, pytest.param("torques that step", marks=pytest.mark.slow)])
+SLOW_CASES = ("undamped", "torques that step")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        name if name not in SLOW_CASES else pytest.param(name, marks=pytest.mark.slow)
+        for name in (*CASES, "torques that step")
+    ],
+)
 def case(request):
     if request.param == "torques that step":
         return stepping(*one_phase(*CASES["time runs out"]))

@@ -26,6 +26,7 @@ except RuntimeError as error:
 """
 
 
+@pytest.mark.slow
 def test_margins_in_single_precision():
     schedule = DATA / "heptagon_torque.csv"
     surroundings = {name: value for name, value in os.environ.items() if name != "JAX_ENABLE_X64"}

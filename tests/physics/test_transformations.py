@@ -24,7 +24,7 @@ OPTIONS = wa.IntegratorOptions(tolerance=1e-7, max_steps=32, max_stages=4, adjoi
 FORWARD = wa.IntegratorOptions(tolerance=1e-7, max_steps=32, max_stages=4, adjoint=Adjoint.FORWARD)
 PLAIN = wa.IntegratorOptions(tolerance=1e-7, max_steps=32, max_stages=4)
 SIZES = Resolution(segments=3, panels=16, nodes=8)
-COARSE = Resolution(segments=3, panels=3, nodes=8)
+COARSE = Resolution(segments=3, panels=8, nodes=8)
 KNOTS = 4
 
 
@@ -113,6 +113,7 @@ GRADIENTS = {
     "jacfwd": lambda f: jax.jacfwd(lambda x: f(x, FORWARD)),
 }
 FUNCTIONS = [margin_of_torque, margin_of_friction, bound_of_mass, quasistatic_of_mass, length_of_friction]
+LONG = (margin_of_torque, margin_of_friction, gradient_of_torque)
 QUICK = {"value_and_grad", "grad of scan"}  # of the gradients of whole margins, which take long to record
 
 
@@ -120,13 +121,21 @@ def gradient_cases():
     """Every function with every transformation; what takes longest and differs least from others is slow."""
     for function in FUNCTIONS:
         for name, transform in GRADIENTS.items():
-            is_slow = function in (margin_of_torque, margin_of_friction) and name not in QUICK
+            is_slow = function in LONG and name not in QUICK
             marks = pytest.mark.slow if is_slow else ()
             yield pytest.param(function, transform, id=f"{function.__name__}-{name}", marks=marks)
 
 
-@pytest.mark.parametrize("transform", VALUES.values(), ids=VALUES.keys())
-@pytest.mark.parametrize("function", [*FUNCTIONS, gradient_of_torque])
+def value_cases():
+    """Every function with every transformation; of what takes long to record, those that differ least are slow."""
+    for function in (*FUNCTIONS, gradient_of_torque):
+        for name, transform in VALUES.items():
+            is_slow = function in LONG and name not in ("vmap", "scan")
+            marks = pytest.mark.slow if is_slow else ()
+            yield pytest.param(function, transform, id=f"{function.__name__}-{name}", marks=marks)
+
+
+@pytest.mark.parametrize(("function", "transform"), [*value_cases()])
 def test_values_can_be_recorded(function, transform, scene, torque):
     value, argument = function(scene, torque)
     assert jax.eval_shape(transform(value), argument).shape == ()

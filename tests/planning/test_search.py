@@ -50,6 +50,7 @@ def test_plans_arrive_when_traced_anew(part, turned):
         assert one.bound > 0
 
 
+@pytest.mark.slow
 def test_the_best_plan_can_be_optimised_as_it_is(turned):
     optimum = wa.optimise(turned.plans[0].scene, knots=21)
     assert optimum.result.status is wa.Status.OK
