@@ -24,7 +24,7 @@ OPTIONS = wa.IntegratorOptions(tolerance=1e-7, max_steps=32, max_stages=4, adjoi
 FORWARD = wa.IntegratorOptions(tolerance=1e-7, max_steps=32, max_stages=4, adjoint=Adjoint.FORWARD)
 PLAIN = wa.IntegratorOptions(tolerance=1e-7, max_steps=32, max_stages=4)
 SIZES = Resolution(segments=3, panels=16, nodes=8)
-COARSE = Resolution(segments=3, panels=8, nodes=8)
+COARSE = Resolution(segments=3, panels=4, nodes=8)
 KNOTS = 4
 
 
