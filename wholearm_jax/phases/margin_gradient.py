@@ -95,7 +95,7 @@ def _trace_along(scene: Scene, directions, resolution: Resolution) -> TracedAlon
     return TracedAlong(eqx.combine(values, others), slopes)
 
 
-@CachedJit
+@partial(CachedJit, compiler_options=COMPILED_SOONER)
 def _margin_along(
     traced: TracedAlong, timed: Timed, directions: Timed, arrivals: Int[Array, "phases"], options: IntegratorOptions
 ) -> tuple[Float[Array, ""], Float[Array, "directions"]]:
