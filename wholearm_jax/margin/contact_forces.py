@@ -11,21 +11,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from wholearm_jax.dynamics import PathDynamics, evaluate_dot, locate_panel
-from wholearm_jax.model import PhaseSchedule, torque_at
-from wholearm_jax.simulation import DenseOutput, evaluate_dense
+from wholearm_jax.simulation import DenseOutput, Drive, evaluate_dense, evaluate_memory, torque_of
 
 SAMPLES_PER_STEP = 7  # places in a step at which forces are sampled before the minimum is refined
 MAX_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
 
 
 def contact_force(
-    dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, segment, row, phase_time, s, w
+    dynamics: PathDynamics, phase_schedule: Drive, duration, segment, row, phase_time, s, w, memory=None
 ) -> Float[Array, "rows"]:
-    """Evaluate the constraint forces [N] for forward travel: `c_n`, or `c_t` in tangential rows."""
+    """Evaluate the constraint forces [N] for forward travel: `c_n`, or `c_t` in tangential rows.
+
+    `memory` is what a closed-loop law remembers.
+    """
     panel, xi = locate_panel(dynamics, segment, s)
     v = w / duration
     terms = jnp.stack([jnp.ones_like(v), v**2, v])
-    return evaluate_dot(dynamics.force, panel, xi, jnp.concatenate([terms, torque_at(phase_schedule, row, phase_time)]))
+    terms = jnp.concatenate([terms, torque_of(phase_schedule, row, phase_time, memory)])
+    return evaluate_dot(dynamics.force, panel, xi, terms)
 
 
 def force_slack(dynamics: PathDynamics, forces: Float[Array, "rows"]) -> Float[Array, "rows"]:
@@ -64,16 +67,17 @@ def is_duplicate_facet(dynamics: PathDynamics) -> Bool[Array, "rows"]:
 
 
 def slacks_at(
-    dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, step: DenseOutput, xi, kind=force_slack
+    dynamics: PathDynamics, phase_schedule: Drive, duration, step: DenseOutput, xi, kind=force_slack
 ) -> Float[Array, "rows"]:
     """Evaluate `force_slack` (or `cone_facets`) at `xi` in [0, 1] of one step."""
     phase_time, s, w = evaluate_dense(step, xi)
-    return kind(dynamics, contact_force(dynamics, phase_schedule, duration, step.segment, step.row, phase_time, s, w))
+    at = step.segment, step.row, phase_time, s, w, evaluate_memory(step, xi)
+    return kind(dynamics, contact_force(dynamics, phase_schedule, duration, *at))
 
 
 def sampled_slacks(
     dynamics: PathDynamics,
-    phase_schedule: PhaseSchedule,
+    phase_schedule: Drive,
     duration,
     steps: DenseOutput,
     samples: int = SAMPLES_PER_STEP,

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.core import take_row
 from wholearm_jax.margin.contact_forces import contact_force, force_slack, slacks_at
-from wholearm_jax.simulation import IntegratorOptions, path_acceleration, solver_step
+from wholearm_jax.simulation import IntegratorOptions, PathODE, join_state, solver_step, split_state, state_rate
 
 GOLDEN_ITERATIONS = 17  # a Newton step on the true motion follows
 
@@ -55,17 +55,18 @@ def refine_minimum(inputs, options: IntegratorOptions, row, xi, low, high):
     # Evaluate the slack and its slope in time where a step of the solver ends at `xi`.
     dynamics, phase_schedule, duration, step, w_begin = inputs
     width = step.phase_time[1] - step.phase_time[0]
-    phase_time, begin = step.phase_time[0] + xi * width, jnp.stack([step.quintic[0], w_begin])
-    s, w = solver_step(
+    phase_time, begin = step.phase_time[0] + xi * width, _begin_state(step, w_begin)
+    end = solver_step(
         dynamics, phase_schedule, duration, options, step.segment, step.row, step.phase_time[0], begin, xi * width
     )
 
-    def slack(phase_time, s, w):
-        forces = contact_force(dynamics, phase_schedule, duration, step.segment, step.row, phase_time, s, w)
+    def slack(phase_time, y):
+        at = step.segment, step.row, phase_time, *split_state(y)
+        forces = contact_force(dynamics, phase_schedule, duration, *at)
         return take_row(force_slack(dynamics, forces), row)
 
-    acceleration = path_acceleration(dynamics, phase_schedule, duration, step.segment, step.row, phase_time, s, w)
-    value, slope = jax.jvp(slack, (phase_time, s, w), (jnp.ones_like(phase_time), w, acceleration))
+    rate = state_rate(PathODE(dynamics, phase_schedule, duration), step.segment, step.row, phase_time, end)
+    value, slope = jax.jvp(slack, (phase_time, end), (jnp.ones_like(phase_time), rate))
     # Take one Newton step to the minimum.
     safe_width = jnp.where(width > 0, width, 1.0)
 
@@ -94,6 +95,10 @@ def _(primals, tangents):
         lambda inputs: refine_minimum(inputs, options, row, xi, 0.0, 1.0)[0], (inputs,), (inputs_dot,)
     )
     return minimum, rate
+
+
+def _begin_state(step, w_begin):
+    return join_state(step.quintic[0], w_begin, None if step.memory is None else step.memory[0])
 
 
 def _second_derivative(function, x):

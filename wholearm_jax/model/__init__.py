@@ -24,6 +24,7 @@ from wholearm_jax.model.kinematics import (
     slip_velocity,
     tangential_jacobian,
 )
+from wholearm_jax.model.law_tables import LawTables, PhaseTables
 from wholearm_jax.model.mechanics import ScaledMechanics, configuration_unit, scaled_mechanics
 from wholearm_jax.model.outline import find_defect, remains_simple
 from wholearm_jax.model.resting import edge_on_palm, resting_angle, resting_configuration

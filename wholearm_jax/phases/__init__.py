@@ -1,6 +1,14 @@
 """Phases one after the other: trace, simulate, assess, describe, sample, differentiate."""
 
 from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, IMPULSE_ROUNDING, assess_phase
+from wholearm_jax.phases.closed_loop import (
+    closed_loop_margin,
+    closed_loop_options,
+    closed_loop_step,
+    initial_loop_carry,
+    require_phases,
+    simulate_closed_loop,
+)
 from wholearm_jax.phases.compressive_margin import margin
 from wholearm_jax.phases.gradients import check_gradient
 from wholearm_jax.phases.obstacles import describe_overlaps

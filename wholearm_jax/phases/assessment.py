@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import Status
 from wholearm_jax.dynamics import Impact, PathDynamics
@@ -35,6 +35,7 @@ def assess_phase(
     goal: Arrival | Int[Array, ""],
     impact: Impact,
     arrival: float | Float[Array, ""] = DEFAULT_ARRIVAL,
+    is_slow: Bool[Array, ""] | None = None,
 ) -> Assessment:
     """Decide the status of a phase from the earliest trouble.
 
@@ -50,6 +51,7 @@ def assess_phase(
         goal: How the phase must end, an `Arrival`.
         impact: Impact at which the phase is entered.
         arrival: Distance from the path's end within which the phase must end, in path lengths.
+        is_slow: Whether the motion ends slowly enough for a rest (None: by `ARRIVAL_SPEED_FACTOR`).
     """
     holds = goal == Arrival.HOLD
     slack = force_slack(dynamics, impact.impulse)  # impulses have the cones of forces
@@ -57,7 +59,7 @@ def assess_phase(
     contact_lost, end_time = int(Status.CONTACT_LOST), motion.phase_time[motion.count]
     is_lost = jnp.isfinite(margin_result.loss_time) & ~holds
     hold_status, departure_time = _assess_hold(motion)
-    arrival_status = _assess_arrival(dynamics, motion, goal == Arrival.AT_REST, arrival)
+    arrival_status = _assess_arrival(dynamics, motion, goal == Arrival.AT_REST, arrival, is_slow)
     rows = (  # condition, status, phase time, contact
         (dynamics.status != int(Status.OK), dynamics.status, 0.0, -1),
         (pulls, contact_lost, 0.0, jnp.argmin(slack)),
@@ -73,12 +75,12 @@ def assess_phase(
     )
 
 
-def _assess_arrival(dynamics: PathDynamics, motion: Motion, at_rest, arrival) -> Int[Array, ""]:
+def _assess_arrival(dynamics: PathDynamics, motion: Motion, at_rest, arrival, is_slow) -> Int[Array, ""]:
     """Decide the status of a phase that moves the object to its path's end, `at_rest` or at any speed."""
     phase_time, s, w = (values[motion.count] for values in (motion.phase_time, motion.s, motion.w))
     max_speed = jnp.sqrt(ARRIVAL_SPEED_FACTOR * jnp.asarray(arrival, s.dtype))
     is_near = jnp.abs(dynamics.breakpoints[-1] - s) <= arrival * dynamics.length
-    is_slow = w <= max_speed * dynamics.length
+    is_slow = w <= max_speed * dynamics.length if is_slow is None else is_slow
     is_late = phase_time >= 1 - max_speed
     ended = motion.status
     reached = (ended == Status.LEFT_FORMATION) | (ended == Status.OK)

@@ -16,7 +16,7 @@ from wholearm_jax.margin import MarginResult, minimum_margin
 from wholearm_jax.model import Arrival, TorqueSchedule, restrict_to_phase, uniform_schedule
 from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL, Assessment, assess_phase
 from wholearm_jax.phases.phase_tracing import MIN_LENGTH
-from wholearm_jax.simulation import IntegratorOptions, Motion, simulate_motion, tolerance_as_data
+from wholearm_jax.simulation import Drive, IntegratorOptions, Motion, simulate_motion, tolerance_as_data
 from wholearm_jax.tracing import Resolution
 
 
@@ -76,20 +76,41 @@ def _simulate_phase(
     arrival,
 ) -> SimulatedPhase:
     """Simulate, score and assess one phase; see `simulate_phase`."""
-    # Enter the phase and integrate its motion.
     phase_schedule = restrict_to_phase(schedule, start, duration)
+    return simulate_under(dynamics, phase_schedule, start, duration, incoming_velocity, options, goal, arrival)
+
+
+def simulate_under(
+    dynamics: PathDynamics,
+    drive: Drive,
+    start,
+    duration,
+    incoming_velocity,
+    options: IntegratorOptions,
+    goal,
+    arrival,
+    memory=None,
+    is_slow=None,
+) -> SimulatedPhase:
+    """Simulate, score and assess one phase under a schedule or, with its `memory`, a closed-loop law.
+
+    `is_slow(motion)` says whether a motion ends slowly enough for a rest (None: `assess_phase` decides).
+    """
+    # Enter the phase and integrate its motion.
     impact = resolve_impact(dynamics, incoming_velocity)
-    motion = simulate_motion(dynamics, phase_schedule, duration, options=options, speed=jnp.maximum(impact.speed, 0.0))
+    speed = jnp.maximum(impact.speed, 0.0)
+    motion = simulate_motion(dynamics, drive, duration, options=options, speed=speed, memory=memory)
     # Compute the margin: unknown for part of a motion, and without a path. A path whose start lies beyond an edge of
     # its formation, be it by rounding, is as good as any beside it.
-    margin_result = minimum_margin(dynamics, phase_schedule, duration, motion, options)
+    margin_result = minimum_margin(dynamics, drive, duration, motion, options)
     starts_beyond = (dynamics.status == int(Status.LEFT_FORMATION)) & (dynamics.length > MIN_LENGTH)
     has_path = (dynamics.status == int(Status.OK)) | starts_beyond
     is_known = has_path & (motion.status != int(Status.MAX_STEPS))
     margin = jnp.where(is_known, margin_result.margin, -jnp.inf)
     margin_result = eqx.tree_at(lambda r: r.margin, margin_result, margin)
     # Assess the end, and evaluate the velocity there.
-    assessment = assess_phase(dynamics, motion, margin_result, goal, impact, arrival)
+    slow = None if is_slow is None else is_slow(motion)
+    assessment = assess_phase(dynamics, motion, margin_result, goal, impact, arrival, slow)
     last = jnp.maximum(motion.count - 1, 0)
     panel, xi = locate_panel(dynamics, motion.segment[last], motion.s[motion.count])
     exit_velocity = evaluate(dynamics.velocity, panel, xi) * motion.w[motion.count] / duration

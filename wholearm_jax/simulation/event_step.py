@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from wholearm_jax.core import eps_power, find_bracketed_root
 from wholearm_jax.simulation.integrator_options import IntegratorOptions
-from wholearm_jax.simulation.path_ode import PathODE, solver_step, state_rate
+from wholearm_jax.simulation.path_ode import PathODE, join_state, solver_step, state_rate
 
 MAX_EVENT_ITERATIONS = 40
 
@@ -24,6 +24,7 @@ class EventStep(NamedTuple):
     w: Float[Array, ""]
     at_stop: Bool[Array, ""]  # on `s_stop`; else at rest
     failed: Bool[Array, ""]  # no event lies within the step's length of where it ends
+    memory: Float[Array, "memory"] | None  # of a closed-loop law
 
 
 def step_to_event(
@@ -39,20 +40,20 @@ def step_to_event(
         options: Options of the integrator.
         segment: Segment of the path.
         row: Interval of the schedule.
-        start: Phase time, `s` and `w` where the step begins.
+        start: Phase time, `s`, `w` and the memory of a law (None: open loop) where the step begins.
         end: Phase time before which the event lies.
         s_stop: Where the segment ends (infinite: nowhere).
         w_stop: Speed at which the object rests: 0 (minus infinity: never).
         is_needed: Whether there is an event; else the step has no length.
     """
-    phase_time, s, w = start
-    y, max_length = jnp.stack([s, w]), jnp.where(is_needed, end - phase_time, 0.0)
+    phase_time, s, w, memory = start
+    y, max_length = join_state(s, w, memory), jnp.where(is_needed, end - phase_time, 0.0)
     length = _length_to_event(*stop_gradient((ode, phase_time, y, max_length, s_stop)), w_stop, options, segment, row)
     y = solver_step(*ode, options, segment, row, phase_time, y, length)
     rate = stop_gradient(state_rate(ode, segment, row, phase_time + length, y))
     # Choose the event that is nearer in time: an object that comes to rest just at the stop meets both.
     targets = jnp.stack([jnp.where(jnp.isfinite(s_stop), s_stop, 0.0), jnp.zeros_like(s_stop)])
-    delays = (targets - y) / jnp.where(is_needed & (rate != 0), rate, 1.0)
+    delays = (targets - y[:2]) / jnp.where(is_needed & (rate[:2] != 0), rate[:2], 1.0)
     is_possible = jnp.stack([jnp.isfinite(s_stop) & (rate[0] > 0), jnp.isfinite(w_stop) & (rate[1] < 0)])
     event = jnp.argmin(jnp.where(is_possible, jnp.abs(stop_gradient(delays)), jnp.inf))
     at_stop = is_needed & (event == 0)
@@ -67,6 +68,7 @@ def step_to_event(
         w=jnp.where(at_stop, y[1], 0.0),
         at_stop=at_stop,
         failed=failed,
+        memory=None if memory is None else y[2:],
     )
 
 

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import take_row
-from wholearm_jax.model import PhaseSchedule, interval
+from wholearm_jax.model import interval
+from wholearm_jax.simulation.closed_loop import Drive
 from wholearm_jax.simulation.integrator_options import IntegratorOptions, solver_with_loop
 
 MAX_FIRST_STEP = 1 / 32  # of the phase
@@ -25,7 +26,7 @@ class AcceptedSteps(NamedTuple):
 
     end: Float[Array, "steps"]  # phase time at the end of each step
     row: Int[Array, "steps"]  # interval of the schedule in which it lies
-    y: Float[Array, "steps 2"]  # state at its end
+    y: Float[Array, "steps state"]  # state at its end
     count: Int[Array, ""]
     passed: Bool[Array, ""]  # whether the last step passes the terminal event
     complete: Bool[Array, ""]  # whether the event or the end of time was reached within `max_steps`
@@ -48,7 +49,7 @@ class _IntegratorState(NamedTuple):
     end: Float[Array, ""]  # phase time
     size: Float[Array, ""]  # its length if no knot had cut it short
     row: Int[Array, ""]  # interval of the schedule
-    y: Float[Array, "2"]  # state at `begin`
+    y: Float[Array, "state"]  # state at `begin`
 
     # solver
     made_jump: Bool[Array, ""] | bool  # whether the field jumps at `begin`
@@ -71,11 +72,11 @@ class _Method(NamedTuple):
 
 def integrate_adaptive(
     field: Callable,
-    phase_schedule: PhaseSchedule,
+    phase_schedule: Drive,
     options: IntegratorOptions,
     begin: Float[Array, ""],
     final: Float[Array, ""],
-    y: Float[Array, "2"],
+    y: Float[Array, "state"],
     event: TerminalEvent,
     distance: Float[Array, ""],
 ) -> AcceptedSteps:
@@ -142,7 +143,7 @@ def _method(field: Callable, options: IntegratorOptions) -> _Method:
 
 
 def _initial_state(
-    method: _Method, phase_schedule: PhaseSchedule, options: IntegratorOptions, begin, final, y, distance
+    method: _Method, phase_schedule: Drive, options: IntegratorOptions, begin, final, y, distance
 ) -> _IntegratorState:
     """Choose the first step, and make room for `max_steps` steps."""
     half_way = jnp.where(y[1] > 0, distance / jnp.where(y[1] > 0, 2 * y[1], 1.0), 1.0)
@@ -151,7 +152,7 @@ def _initial_state(
     no_steps = AcceptedSteps(
         end=jnp.full(options.max_steps, begin),
         row=jnp.zeros(options.max_steps, int),
-        y=jnp.broadcast_to(y, (options.max_steps, 2)),
+        y=jnp.broadcast_to(y, (options.max_steps, *y.shape)),
         count=jnp.asarray(0, int),
         passed=jnp.asarray(False),
         complete=jnp.asarray(False),
@@ -164,7 +165,7 @@ def _initial_state(
     return _IntegratorState(begin, end, size, row, y, made_jump, solver_state, controller_state, attempts, no_steps)
 
 
-def _step_end(phase_schedule: PhaseSchedule, final, begin, size, row):
+def _step_end(phase_schedule: Drive, final, begin, size, row):
     """Return where a step ends: on the end of its interval of the schedule, rather than beyond or just before it."""
     knot = jnp.minimum(jnp.where(row < phase_schedule.last, take_row(phase_schedule.phase_time, row + 1), final), final)
     return jnp.where(begin + size > knot - 100 * jnp.finfo(size.dtype).eps, knot, begin + size)

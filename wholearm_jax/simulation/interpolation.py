@@ -4,13 +4,15 @@ Between accepted steps `s(u)` is the quintic with the right `s`, `ds/du` and `d2
 forces are known at every time. Derivation: section 7 of `docs/derivation.md`.
 """
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.dynamics import PathDynamics, differentiate_polynomial, evaluate_polynomial
-from wholearm_jax.model import PhaseSchedule
+from wholearm_jax.simulation.closed_loop import Drive, PhaseLoop, memory_rate
 from wholearm_jax.simulation.motion_record import Motion
 from wholearm_jax.simulation.path_ode import path_acceleration
 
@@ -24,25 +26,44 @@ class DenseOutput(eqx.Module):
     row: Int[Array, "steps"]  # interval of the torque schedule
     at_rest: Bool[Array, "steps"]  # whether friction holds the object
     live: Bool[Array, "steps"]  # whether there is such a step, and it takes time
+    memory: Float[Array, "steps 4 memory"] | None = None  # of a closed-loop law, as cubic polynomials in xi
 
 
 def dense_output(
-    dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration: Float[Array, ""], motion: Motion
+    dynamics: PathDynamics, phase_schedule: Drive, duration: Float[Array, ""], motion: Motion
 ) -> DenseOutput:
     """Interpolate the steps of a motion."""
     # A step that takes no time has no speed of its own: its neighbours hold the speeds before and after it.
     live = (jnp.arange(motion.at_rest.shape[0]) < motion.count) & (motion.phase_time[1:] > motion.phase_time[:-1])
     phase_time, s = (jnp.stack([a[:-1], a[1:]], axis=1) for a in (motion.phase_time, motion.s))
     w = jnp.stack([motion.w_begin, motion.w[1:]], axis=1)
-    each = jax.vmap(quintic_hermite, (None, None, None, 0, 0, 0, 0, 0, 0))
-    quintic = each(
-        dynamics, phase_schedule, duration, phase_time, s, w, motion.segment, motion.row, live & ~motion.at_rest
+    memory = None if motion.memory is None else jnp.stack([motion.memory[:-1], motion.memory[1:]], axis=1)
+    axes = None, None, None, 0, 0, 0, 0, 0, 0, None if memory is None else 0
+    quintic = jax.vmap(quintic_hermite, axes)(
+        dynamics, phase_schedule, duration, phase_time, s, w, motion.segment, motion.row, live & ~motion.at_rest, memory
     )
-    return DenseOutput(phase_time, quintic, motion.segment, motion.row, motion.at_rest, live)
+    steps = DenseOutput(phase_time, quintic, motion.segment, motion.row, motion.at_rest, live)
+    if not isinstance(phase_schedule, PhaseLoop):
+        return steps
+    return replace(steps, memory=_cubics(dynamics, phase_schedule, duration, steps, s, memory))
+
+
+def _cubics(dynamics, loop: PhaseLoop, duration, steps: DenseOutput, s, memory) -> Float[Array, "steps 4 memory"]:
+    """Interpolate the memory of a law in each step: cubic polynomials with the right values and rates at both ends."""
+
+    def cubic(phase_time, segment, row, s, memory):
+        rate = jax.vmap(memory_rate, (None, None, None, None, None, 0, 0, 0))(
+            loop, dynamics, duration, segment, row, phase_time, s, memory
+        )
+        d0, d1 = rate * (phase_time[1] - phase_time[0])
+        rise = memory[1] - memory[0]
+        return jnp.stack([memory[0], d0, 3 * rise - 2 * d0 - d1, d0 + d1 - 2 * rise])
+
+    return jax.vmap(cubic)(steps.phase_time, steps.segment, steps.row, s, memory)
 
 
 def quintic_hermite(
-    dynamics: PathDynamics, phase_schedule: PhaseSchedule, duration, phase_time, s, w, segment, row, is_moving
+    dynamics: PathDynamics, phase_schedule: Drive, duration, phase_time, s, w, segment, row, is_moving, memory=None
 ) -> Float[Array, "6"]:
     """Compute the coefficients of the quintic Hermite polynomial of a step in `xi` in [0, 1].
 
@@ -56,10 +77,11 @@ def quintic_hermite(
         segment: Segment of the path.
         row: Interval of the schedule.
         is_moving: Whether the object moves; else `s` is constant.
+        memory: Memory of a closed-loop law at both ends (2, memory); None in open loop.
     """
     width = phase_time[1] - phase_time[0]
-    acceleration = jax.vmap(path_acceleration, (None, None, None, None, None, 0, 0, 0))(
-        dynamics, phase_schedule, duration, segment, row, phase_time, s, w
+    acceleration = jax.vmap(path_acceleration, (None, None, None, None, None, 0, 0, 0, None if memory is None else 0))(
+        dynamics, phase_schedule, duration, segment, row, phase_time, s, w, memory
     )
     d0, d1 = jnp.where(is_moving, w * width, 0.0)
     b0, b1 = jnp.where(is_moving, acceleration * width**2, 0.0)
@@ -87,3 +109,8 @@ def evaluate_dense(step: DenseOutput, xi: Float[Array, ""]):
     is_moving = step.live & ~step.at_rest
     w = jnp.where(is_moving, slope / jnp.where(is_moving, width, 1.0), 0.0)
     return step.phase_time[0] + xi * width, s, w
+
+
+def evaluate_memory(step: DenseOutput, xi: Float[Array, ""]) -> Float[Array, "memory"] | None:
+    """Evaluate the memory of a closed-loop law at `xi` in [0, 1] of one step; None in open loop."""
+    return None if step.memory is None else evaluate_polynomial(step.memory, xi)

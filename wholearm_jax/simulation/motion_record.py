@@ -28,11 +28,13 @@ class Motion(NamedTuple):
     """`ok` (time is over while the object moves), `left_formation` (at the path's end), `stuck`, `reversed`,
     `ambiguous`, `no_convergence` (of the step to an event) or `max_steps`."""
 
+    memory: Float[Array, "nodes memory"] | None = None  # of a closed-loop law at the nodes
+
 
 class MotionRecord(NamedTuple):
     """The steps so far, as in `Motion`."""
 
-    nodes: Float[Array, "nodes 3"]  # phase time, s, w
+    nodes: Float[Array, "nodes columns"]  # phase time, s, w and, in closed loop, the memory
     w_begin: Float[Array, "steps"]
     segment: Int[Array, "steps"]
     row: Int[Array, "steps"]
@@ -45,10 +47,10 @@ class MotionRecord(NamedTuple):
         return self.w_begin.shape[0]
 
 
-def empty_record(capacity: int, first: Float[Array, "3"], row: Int[Array, ""]) -> MotionRecord:
+def empty_record(capacity: int, first: Float[Array, "columns"], row: Int[Array, ""]) -> MotionRecord:
     """Make a record without steps that begins at the node `first`, in the interval `row`."""
     return MotionRecord(
-        nodes=jnp.broadcast_to(first, (capacity + 1, 3)),
+        nodes=jnp.broadcast_to(first, (capacity + 1, *first.shape)),
         w_begin=jnp.zeros(capacity, first.dtype),
         segment=jnp.zeros(capacity, int),
         row=jnp.broadcast_to(row.astype(int), capacity),
@@ -62,7 +64,7 @@ def append_step(record: MotionRecord, is_needed, node, w_begin, segment, row, *,
     capacity = record.capacity
     place = jnp.where(is_needed & (record.count < capacity), record.count + 1, capacity + 1)
     return MotionRecord(
-        nodes=record.nodes.at[place].set(jnp.stack(node), mode="drop"),
+        nodes=record.nodes.at[place].set(_join(node), mode="drop"),
         w_begin=record.w_begin.at[place - 1].set(w_begin, mode="drop"),
         segment=record.segment.at[place - 1].set(segment, mode="drop"),
         row=record.row.at[place - 1].set(row, mode="drop"),
@@ -71,13 +73,29 @@ def append_step(record: MotionRecord, is_needed, node, w_begin, segment, row, *,
     )
 
 
-def append_steps(record: MotionRecord, steps: AcceptedSteps, y: Float[Array, "2"], segment, count) -> MotionRecord:
+def _join(node) -> Float[Array, "columns"]:
+    """Join phase time, s, w and the memory of a law, None in open loop."""
+    *numbers, memory = node
+    return jnp.stack(numbers) if memory is None else jnp.concatenate([jnp.stack(numbers), memory])
+
+
+def append_rest(record: MotionRecord, steps: AcceptedSteps, s, segment, count) -> MotionRecord:
+    """Append the first `count` steps of a rest at `s`; their states are (phase time, 0, *memory)."""
+    rows = jnp.arange(record.capacity)
+    place = jnp.where(rows < count, record.count + 1 + rows, record.capacity + 1)
+    at_rest = record.at_rest.at[place - 1].set(True, mode="drop")
+    still = steps._replace(y=steps.y.at[:, 0].set(s))
+    first = jnp.concatenate([s[None], still.y[0, 1:]])
+    return append_steps(record._replace(at_rest=at_rest), still, first, segment, count)
+
+
+def append_steps(record: MotionRecord, steps: AcceptedSteps, y: Float[Array, "state"], segment, count) -> MotionRecord:
     """Append the first `count` of the steps that begin at the state `y`."""
     capacity = record.capacity
     rows = jnp.arange(capacity)
     place = jnp.where(rows < count, record.count + 1 + rows, capacity + 1)
     nodes = jnp.concatenate([steps.end[:, None], steps.y], axis=1)
-    w_begin = jnp.concatenate([y[1:], steps.y[:-1, 1]])
+    w_begin = jnp.concatenate([y[1:2], steps.y[:-1, 1]])
     return record._replace(
         nodes=record.nodes.at[place].set(nodes, mode="drop"),
         w_begin=record.w_begin.at[place - 1].set(w_begin, mode="drop"),
@@ -91,5 +109,6 @@ def recorded_motion(record: MotionRecord, status: Int[Array, ""]) -> Motion:
     """Make the motion of a record."""
     is_beyond = jnp.arange(record.capacity + 1) > record.count
     nodes = jnp.where(is_beyond[:, None], record.nodes[record.count], record.nodes)
+    memory = nodes[:, 3:] if nodes.shape[1] > 3 else None
     steps = record.w_begin, record.segment, record.row, record.at_rest
-    return Motion(nodes[:, 0], nodes[:, 1], nodes[:, 2], *steps, record.count, status.astype(int))
+    return Motion(nodes[:, 0], nodes[:, 1], nodes[:, 2], *steps, record.count, status.astype(int), memory)

@@ -14,7 +14,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import Status, take_row
 from wholearm_jax.dynamics import PathDynamics
-from wholearm_jax.model import PhaseSchedule, interval
+from wholearm_jax.model import interval
+from wholearm_jax.simulation.closed_loop import Drive, PhaseLoop
+from wholearm_jax.simulation.closed_loop_rest import rest_until_departure
 from wholearm_jax.simulation.departure import first_departure
 from wholearm_jax.simulation.event_step import step_to_event
 from wholearm_jax.simulation.integrator import AcceptedSteps, TerminalEvent, integrate_adaptive
@@ -22,12 +24,13 @@ from wholearm_jax.simulation.integrator_options import Adjoint, IntegratorOption
 from wholearm_jax.simulation.motion_record import (
     Motion,
     MotionRecord,
+    append_rest,
     append_step,
     append_steps,
     empty_record,
     recorded_motion,
 )
-from wholearm_jax.simulation.path_ode import PathODE, state_rate
+from wholearm_jax.simulation.path_ode import PathODE, join_state, state_rate
 from wholearm_jax.simulation.replay import integrate_with_replay_adjoint, replay_steps
 
 
@@ -41,33 +44,37 @@ class _MotionState(NamedTuple):
     status: Int[Array, ""]
     done: Bool[Array, ""]
     record: MotionRecord
+    memory: Float[Array, "memory"] | None  # of a closed-loop law
 
 
 def simulate_motion(
     dynamics: PathDynamics,
-    phase_schedule: PhaseSchedule,
+    phase_schedule: Drive,
     duration: Float[Array, ""],
     *,
     options: IntegratorOptions,
     s: Float[Array, ""] | None = None,
     speed: Float[Array, ""] | float = 0.0,
     ignore_stops: bool | Bool[Array, ""] = False,
+    memory: Float[Array, "memory"] | None = None,
 ) -> Motion:
     """Simulate the motion of one phase along its path.
 
     Args:
         dynamics: Tabulated path dynamics.
-        phase_schedule: Torque schedule of the phase.
+        phase_schedule: Torque schedule of the phase, or closed-loop law.
         duration: Duration of the phase [s].
         options: Options of the integrator.
         s: Where it begins (None: at the path's start).
         speed: `ds/dt` there [1/s].
         ignore_stops: Let the motion pass rest and the path's end with forward signs of friction: a smooth continuation
             to differentiate, not physics.
+        memory: What a closed-loop law remembers there; None in open loop.
     """
     begin = dynamics.breakpoints[0] if s is None else jnp.asarray(s, dynamics.breakpoints.dtype)
     w = jnp.asarray(speed, begin.dtype) * duration
     first = jnp.stack([jnp.zeros((), begin.dtype), begin, w])
+    node = first if memory is None else jnp.concatenate([first, memory])
     state = _MotionState(
         phase_time=first[0],
         s=begin,
@@ -75,7 +82,8 @@ def simulate_motion(
         segment=jnp.asarray(0, int),
         status=jnp.asarray(int(Status.MAX_STEPS), int),
         done=jnp.asarray(False),
-        record=empty_record(options.max_steps, first, phase_schedule.first),
+        record=empty_record(options.max_steps, node, phase_schedule.first),
+        memory=memory,
     )
     ode, ignore_stops = PathODE(dynamics, phase_schedule, duration), jnp.asarray(ignore_stops)
     state = _run_stages(lambda state: _simulate_stage(ode, options, ignore_stops, state), state, options)
@@ -103,7 +111,8 @@ def _simulate_stage(ode: PathODE, options: IntegratorOptions, ignore_stops, stat
     """Wait at rest if need be, then move until the segment ends, the object comes to rest, or time is over."""
     dynamics, phase_schedule, _ = ode
     # Wait at rest.
-    state, rest_status, capacity = _dwell(dynamics, phase_schedule, options, ignore_stops, state)
+    dwell = _dwell_in_closed_loop if isinstance(phase_schedule, PhaseLoop) else _dwell
+    state, rest_status, capacity = dwell(ode, options, ignore_stops, state)
     blocked = rest_status != int(Status.OK)
     # Integrate until the first step past an event.
     is_last = state.segment >= dynamics.count - 1
@@ -116,9 +125,9 @@ def _simulate_stage(ode: PathODE, options: IntegratorOptions, ignore_stops, stat
     last_time, row = jnp.where(overshot, take_row(steps.end, last_step), 1.0), take_row(steps.row, last_step)
     state, complete = _record_steps(state, steps, overshot, capacity)
     # Take that step again up to the event.
-    node = state.phase_time, state.s, state.w
+    node = state.phase_time, state.s, state.w, state.memory
     event = step_to_event(ode, options, state.segment, row, node, last_time, s_stop, w_stop, overshot)
-    record = append_step(state.record, overshot, event[:3], state.w, state.segment, row, at_rest=False)
+    record = append_step(state.record, overshot, (*event[:3], event.memory), state.w, state.segment, row, at_rest=False)
     # Classify the end. An object that has come to rest may start again in the next stage.
     at_path_end, onward = event.at_stop & is_last, event.at_stop & ~is_last
     outcomes = (  # condition, status
@@ -138,14 +147,16 @@ def _simulate_stage(ode: PathODE, options: IntegratorOptions, ignore_stops, stat
         status=jnp.select(conditions, statuses, int(Status.OK)),
         done=blocked | ~complete | event.failed | at_path_end | ~overshot,
         record=record,
+        memory=None if event.memory is None else jnp.where(overshot, event.memory, state.memory),
     )
 
 
-def _dwell(dynamics: PathDynamics, phase_schedule: PhaseSchedule, options, ignore_stops, state: _MotionState):
+def _dwell(ode: PathODE, options, ignore_stops, state: _MotionState):
     """Wait while friction holds an object that is at rest.
 
     Returns the state after it, the status of the departure, and the number of steps that the record has room for.
     """
+    dynamics, phase_schedule, _ = ode
     is_resting = (state.w <= 0) & ~ignore_stops
     phase_time, rest_status = first_departure(dynamics, phase_schedule, state.segment, state.s, state.phase_time)
     phase_time = jnp.where(is_resting, phase_time, state.phase_time)
@@ -153,9 +164,21 @@ def _dwell(dynamics: PathDynamics, phase_schedule: PhaseSchedule, options, ignor
     waits = is_resting & (phase_time > state.phase_time)
     capacity = options.max_steps - state.record.count - waits
     row = interval(phase_schedule, stop_gradient(state.phase_time + phase_time) / 2)
-    node = phase_time, state.s, state.w
+    node = phase_time, state.s, state.w, None
     record = append_step(state.record, waits, node, state.w, state.segment, row, at_rest=True)
     return state._replace(phase_time=phase_time, record=record), rest_status, capacity
+
+
+def _dwell_in_closed_loop(ode: PathODE, options, ignore_stops, state: _MotionState):
+    """Wait as `_dwell` does, while the law goes on."""
+    is_resting = (state.w <= 0) & ~ignore_stops
+    rest = rest_until_departure(ode, options, state.segment, state.s, state.phase_time, state.memory, is_resting)
+    room = options.max_steps - state.record.count
+    record = append_rest(state.record, rest.steps, state.s, state.segment, jnp.minimum(rest.whole, room))
+    node, crosses = (rest.phase_time, state.s, state.w, rest.memory), rest.steps.count > rest.whole
+    record = append_step(record, crosses, node, state.w, state.segment, rest.row, at_rest=True)
+    state = state._replace(phase_time=rest.phase_time, memory=rest.memory, record=record)
+    return state, jnp.where(is_resting, rest.status, int(Status.OK)), room - rest.steps.count
 
 
 def _record_steps(
@@ -168,10 +191,12 @@ def _record_steps(
     """
     complete = steps.complete & (steps.count <= capacity)
     count = jnp.clip(jnp.where(overshot, steps.count - 1, steps.count), 0, jnp.maximum(capacity, 0))
-    record = append_steps(state.record, steps, jnp.stack([state.s, state.w]), state.segment, count)
-    phase_time, s, w = take_row(record.nodes, state.record.count + count)
+    record = append_steps(state.record, steps, join_state(state.s, state.w, state.memory), state.segment, count)
+    node = take_row(record.nodes, state.record.count + count)
+    phase_time, s, w = node[0], node[1], node[2]
     w = jnp.where(count > 0, w, state.w)  # a node at a segment's end holds the speed in the chart before
-    return state._replace(phase_time=phase_time, s=s, w=w, record=record), complete
+    memory = None if state.memory is None else node[3:]
+    return state._replace(phase_time=phase_time, s=s, w=w, record=record, memory=memory), complete
 
 
 def _integrate(ode: PathODE, options: IntegratorOptions, state: _MotionState, final, s_stop, w_stop) -> AcceptedSteps:
@@ -181,7 +206,8 @@ def _integrate(ode: PathODE, options: IntegratorOptions, state: _MotionState, fi
     distance = limits[0] - stop_gradient(state.s)
     tolerance = options.tolerance + 64 * jnp.finfo(state.s.dtype).eps * jnp.abs(stop_gradient(state.s))
     limits = *limits, tolerance
-    inputs = (dynamics, duration, state.segment), phase_schedule, state.phase_time, jnp.stack([state.s, state.w])
+    y = join_state(state.s, state.w, state.memory)
+    inputs = (dynamics, duration, state.segment), phase_schedule, state.phase_time, y
     if options.adjoint is Adjoint.REVERSE:
         return integrate_with_replay_adjoint(inputs, _field, _terminal_event, options, final, limits, distance)
 
@@ -194,7 +220,7 @@ def _integrate(ode: PathODE, options: IntegratorOptions, state: _MotionState, fi
     return solve(replay_steps, *inputs, steps)
 
 
-def _field(parameters, phase_schedule: PhaseSchedule):
+def _field(parameters, phase_schedule: Drive):
     """Return the field of a segment for the integrator."""
     dynamics, duration, segment = parameters
     ode = PathODE(dynamics, phase_schedule, duration)

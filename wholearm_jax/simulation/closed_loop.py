@@ -1,0 +1,96 @@
+r"""A closed-loop law in the time of one phase: its torque, and the rate of what it remembers.
+
+In continuous time the law of `docs/feedback.md` is an ordinary differential equation for its memory `(s, v, i)`, the
+observed place and speed and the integral part, driven by the place `q` of the true joint angles:
+
+    ds/dt = v + 2 w_o (q - s),    dv/dt = w_o^2 (q - s),    di/dt = k w^2 (s_ref - s) where nothing is cut
+
+Along a path `q` is a function of the path's own parameter; the torque is one of time and memory.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
+
+from wholearm_jax.core import take_row
+from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
+from wholearm_jax.model import PhaseSchedule, torque_at
+
+MEMORY = 3  # numbers that the law remembers
+
+
+class PhaseLoop(eqx.Module):
+    """The law of one phase on one path, in phase time; stands where a `PhaseSchedule` does in open loop.
+
+    Interval `k` of the reference runs from row `k` to row `k + 1`; the reference may jump between intervals.
+    """
+
+    # over phase time
+    phase_time: Float[Array, "rows"]
+    reference: Float[Array, "rows_less_1 4"]  # s_ref [rad], v_ref [rad/s], torque [N m], where each interval begins
+    slope: Float[Array, "rows_less_1 4"]  # their rates in phase time
+    presses: Bool[Array, "rows_less_1"]  # whether `press` bounds the feedback forward
+    first: Int[Array, ""]  # interval
+    last: Int[Array, ""]  # interval
+
+    # along the path
+    place: Float[Array, "panels powers"]  # of the joint angles on the law's curve [rad], as functions of `PathDynamics`
+    s: Float[Array, "nodes"]
+    gain: Float[Array, "nodes 2"]
+
+    # constants
+    stiffness: Float[Array, ""]
+    integral: Float[Array, ""]
+    observer: Float[Array, ""]
+    push: Float[Array, ""]
+    press: Float[Array, ""]
+    torque_limit: Float[Array, "2"]
+
+
+Drive = PhaseSchedule | PhaseLoop
+"""What gives the torques of a phase."""
+
+
+def interpolate_rows(places: Float[Array, "rows"], values: Float[Array, "rows *shape"], at) -> Float[Array, "*shape"]:
+    """Interpolate a table linearly; it is constant beyond its ends."""
+    k = jnp.clip((stop_gradient(at) >= places).sum() - 1, 0, places.shape[0] - 2)
+    begin, end = take_row(places, k), take_row(places, k + 1)
+    share = jnp.clip((at - begin) / jnp.where(end > begin, end - begin, 1.0), 0.0, 1.0)
+    low, high = take_row(values, k), take_row(values, k + 1)
+    return low + share * (high - low)
+
+
+def _act(loop: PhaseLoop, row, phase_time, memory):
+    """Return the feed-forward torque, the gain, the acceleration asked for, whether it was cut, and the error."""
+    since = phase_time - take_row(loop.phase_time, row)
+    now = take_row(loop.reference, row) + take_row(loop.slope, row) * since
+    s, v, i = memory
+    gain = interpolate_rows(loop.s, loop.gain, s)
+    most = loop.push / jnp.abs(gain).max()
+    ahead = jnp.where(take_row(loop.presses, row), jnp.minimum(most, loop.press), most)
+    error = loop.stiffness**2 * (now[0] - s)
+    wanted = error + 2 * loop.stiffness * (now[1] - v) + i
+    is_cut = (wanted > ahead) | (wanted < -most)
+    return now[2:], gain, jnp.minimum(jnp.maximum(wanted, -most), ahead), is_cut, error
+
+
+def torque_of(drive: Drive, row, phase_time, memory=None) -> Float[Array, "2"]:
+    """Evaluate the torque [N m] of a schedule, or of a law with its memory, in an interval."""
+    if not isinstance(drive, PhaseLoop):
+        return torque_at(drive, row, phase_time)
+    torque, gain, acceleration, _, _ = _act(drive, row, phase_time, memory)
+    return jnp.clip(torque + gain * acceleration, -drive.torque_limit, drive.torque_limit)
+
+
+def memory_rate(drive: PhaseLoop, dynamics: PathDynamics, duration, segment, row, phase_time, s, memory):
+    """Evaluate the rate of the memory in phase time, where the path's parameter is `s`."""
+    off = place_on_path(drive, dynamics, segment, s) - memory[0]
+    *_, is_cut, error = _act(drive, row, phase_time, memory)
+    integral = jnp.where(is_cut, 0.0, drive.integral * error)
+    return duration * jnp.stack([memory[1] + 2 * drive.observer * off, drive.observer**2 * off, integral])
+
+
+def place_on_path(loop: PhaseLoop, dynamics: PathDynamics, segment, s) -> Float[Array, ""]:
+    """Return the place [rad] of the joint angles at the path's parameter `s` on the law's curve."""
+    return evaluate(loop.place, *locate_panel(dynamics, segment, s))
