@@ -18,33 +18,45 @@ from jax.sharding import Mesh
 from wholearm_jax.core import on_host, require_positive, require_x64
 from wholearm_jax.ensembles.ensemble import Ensemble
 from wholearm_jax.ensembles.passes import run_pass
-from wholearm_jax.ensembles.scene_batch import SceneBatch, stack_scenes
+from wholearm_jax.ensembles.scene_batch import SceneBatch, SceneSource, stack_scenes
 from wholearm_jax.ensembles.scene_check import COARSE_PASS, FINE_PASS, BatchResult, Fidelity, NextPass, from_result
-from wholearm_jax.model import Scene, TorqueSchedule, pad_schedule
-from wholearm_jax.phases import has_torque_jumps, require_covered, require_motion, simulate
+from wholearm_jax.feedback import Controller, law_tables, require_same_plan
+from wholearm_jax.model import LawTables, Scene, TorqueSchedule, pad_schedule
+from wholearm_jax.phases import (
+    closed_loop_options,
+    closed_loop_result,
+    has_torque_jumps,
+    require_covered,
+    require_motion,
+    require_phases,
+    simulate,
+)
 
 CHUNK = 4096  # scenes whose results are kept together
 BATCH_ARRIVAL = 0.01  # fraction of the path: scenes that vary cannot end exactly where the nominal scene must
+LOOP_TOLERANCE = 1e-7  # least tolerance of the integrator in closed loop: a law makes errors fade
 MIN_COARSE_TOLERANCE = 1e-9  # [N], smaller tolerances begin at the full resolution
 
 
 @on_host("check outside of the transformation; jax.vmap takes wholearm_jax.margin")
 def check(
     scenes: Ensemble | Scene | Sequence[Scene],
-    torque: TorqueSchedule,
+    torque: TorqueSchedule | None = None,
     *,
+    controller: Controller | LawTables | None = None,
     count: int | None = None,
     tolerance: float = 1e-6,
     arrival: float = BATCH_ARRIVAL,
     chunk: int = CHUNK,
     devices: Sequence[Any] | None = None,
 ) -> BatchResult:
-    """Check a torque schedule against many scenes.
+    """Check a torque schedule, or a closed-loop law, against many scenes.
 
     Args:
         scenes: An ensemble, stacked scenes, or a sequence of scenes, which may differ in every number, in their
             formations and in the number of vertices (`scene_batch.stack_scenes`).
         torque: Schedule that covers the plan of every scene.
+        controller: Instead of a schedule, the law that drives every scene (`feedback`).
         count: Number of scenes, counted from the first; required for an ensemble.
         tolerance: Error of the margins [N]: 1e-6, or below 1e-9 all is computed as by `simulate`.
         arrival: Distance from the path's end within which a phase must end, as a fraction of the path's length, at a
@@ -56,7 +68,7 @@ def check(
         Status, margin, time, contact, phase and end pose of each scene. A scene that fails never raises.
 
     Raises:
-        ValueError: For one scene that is not stacked, a schedule shorter than a plan, a number that is not positive, or
+        ValueError: For one scene that is not stacked, a controller of another plan, a schedule shorter than a plan, a number that is not positive, or
             a `count` of more scenes than are given.
     """
     if isinstance(scenes, Scene) and np.ndim(scenes.object.mass) == 0:
@@ -72,13 +84,14 @@ def check(
         count = source.count
     elif isinstance(source, SceneBatch) and count > source.count:
         raise ValueError(f"count is {count}, but {source.count} scenes are given")
-    chunks = check_in_chunks(source, torque, count, tolerance=tolerance, arrival=arrival, chunk=chunk, devices=devices)
+    drive = choose_drive(source, torque, controller)
+    chunks = check_in_chunks(source, drive, count, tolerance=tolerance, arrival=arrival, chunk=chunk, devices=devices)
     return BatchResult(*(np.concatenate(column) for column in zip(*(part for _, part in chunks), strict=True)))
 
 
 def check_in_chunks(
     source: Ensemble | SceneBatch,
-    torque: TorqueSchedule,
+    torque: TorqueSchedule | LawTables,
     count: int,
     *,
     tolerance: float = 1e-6,
@@ -89,12 +102,15 @@ def check_in_chunks(
 ) -> Iterator[tuple[int, BatchResult]]:
     """Check scenes one chunk after the other, and yield each chunk's number and results.
 
-    `chunk_numbers` selects chunks and their order (default: all); the other arguments are those of `check`.
+    `torque` may be a closed-loop law; `chunk_numbers` selects chunks and their order (default: all); the other arguments are those of `check`.
     """
     require_x64(source.nominal, torque)
     require_positive(count=count, tolerance=tolerance, arrival=arrival, chunk=chunk)
     require_motion(source.nominal)  # holds need linear programmes, which compiled checks leave out
-    require_covered(source.nominal, torque)
+    if isinstance(torque, LawTables):
+        require_phases(source.nominal, torque)
+    else:
+        require_covered(source.nominal, torque)
     mesh = Mesh(np.asarray(devices or jax.local_devices()), ("scenes",))
     passes = (COARSE_PASS, FINE_PASS) if tolerance >= MIN_COARSE_TOLERANCE else (FINE_PASS,)
     for number in range(-(-count // chunk)) if chunk_numbers is None else chunk_numbers:
@@ -105,16 +121,16 @@ def check_in_chunks(
 def _check_chunk(
     source: Ensemble | SceneBatch,
     numbers: np.ndarray,
-    torque: TorqueSchedule,
+    torque: TorqueSchedule | LawTables,
     arrival,
     passes: tuple[Fidelity, ...],
     mesh,
 ) -> BatchResult:
     """Check the scenes `numbers` pass by pass, and simulate alone those that no pass settles."""
-    schedule, jumps = pad_schedule(torque), has_torque_jumps(source.nominal, torque)
+    schedule = torque if isinstance(torque, LawTables) else pad_schedule(torque)
     results, rows, single = None, np.arange(len(numbers)), []
     for fidelity in passes:
-        fidelity = fidelity._replace(options=replace(fidelity.options, has_jumps=jumps))
+        fidelity = _fidelity_for(source.nominal, torque, fidelity)
         part, next_pass = run_pass(source, numbers[rows], schedule, arrival, fidelity, mesh)
         if results is None:
             results = part
@@ -126,11 +142,36 @@ def _check_chunk(
             break
     assert results is not None
     for row in np.concatenate([*single, rows]):
-        result = simulate(
-            source.draw(jnp.asarray(numbers[row])), torque, arrival=float(arrival)
-        )  # refines until all is fine
+        simulated = closed_loop_result if isinstance(torque, LawTables) else simulate  # refines until all is fine
+        result = simulated(source.draw(jnp.asarray(numbers[row])), torque, arrival=float(arrival))
         _overwrite(results, row, from_result(result))
     return results
+
+
+def _fidelity_for(nominal: Scene, torque: TorqueSchedule | LawTables, fidelity: Fidelity) -> Fidelity:
+    """Return the fidelity with the options that a schedule, or a law, requires."""
+    if isinstance(torque, LawTables):
+        tolerance = max(fidelity.options.tolerance, LOOP_TOLERANCE)
+        options = replace(closed_loop_options(fidelity.options), tolerance=tolerance)
+    else:
+        options = replace(fidelity.options, has_jumps=has_torque_jumps(nominal, torque))
+    return fidelity._replace(options=options)
+
+
+def choose_drive(
+    source: SceneSource, torque: TorqueSchedule | None, controller: Controller | LawTables | None
+) -> TorqueSchedule | LawTables:
+    """Return the schedule or the law that drives the scenes; raises ValueError unless there is one of them."""
+    if (torque is None) == (controller is None):
+        raise ValueError("give either a torque schedule or a controller")
+    if torque is not None:
+        return torque
+    if isinstance(controller, LawTables):
+        return controller
+    assert controller is not None
+    if isinstance(source, Ensemble):
+        require_same_plan(controller, source.nominal)
+    return law_tables(controller)
 
 
 def _overwrite(results: BatchResult, rows, part: BatchResult) -> None:

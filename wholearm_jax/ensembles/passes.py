@@ -18,7 +18,7 @@ from wholearm_jax.core import CachedJit, compile_in_background, wait_for
 from wholearm_jax.ensembles.ensemble import Ensemble
 from wholearm_jax.ensembles.scene_batch import SceneBatch, SceneSource
 from wholearm_jax.ensembles.scene_check import BatchResult, Fidelity, check_on_paths
-from wholearm_jax.model import TorqueSchedule
+from wholearm_jax.model import LawTables, TorqueSchedule
 from wholearm_jax.phases import trace_paths_in_one_program
 from wholearm_jax.tracing import placeholder_path
 
@@ -28,7 +28,7 @@ BLOCK = 128  # scenes that one device takes at once
 def run_pass(
     source: Ensemble | SceneBatch,
     numbers: np.ndarray,
-    schedule: TorqueSchedule,
+    schedule: TorqueSchedule | LawTables,
     arrival,
     fidelity: Fidelity,
     mesh: Mesh,
@@ -49,7 +49,9 @@ def run_pass(
     return jax.tree.map(lambda *columns: np.concatenate([np.asarray(c) for c in columns])[: len(numbers)], *parts)
 
 
-def _check_block(source: SceneSource, numbers, schedule: TorqueSchedule, arrival, fidelity: Fidelity, mesh: Mesh):
+def _check_block(
+    source: SceneSource, numbers, schedule: TorqueSchedule | LawTables, arrival, fidelity: Fidelity, mesh: Mesh
+):
     """Check `BLOCK` scenes a device."""
     side_by_side = mesh.devices.flat[0].platform != "cpu"
     common = source, schedule, arrival, fidelity, side_by_side

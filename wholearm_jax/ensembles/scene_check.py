@@ -10,18 +10,20 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import Status, stack_trees
 from wholearm_jax.dynamics import PathDynamics, tabulate_path_dynamics
-from wholearm_jax.model import ContactFormation, Scene, TorqueSchedule, rigid_body, scaled_mechanics
+from wholearm_jax.model import ContactFormation, LawTables, Scene, TorqueSchedule, rigid_body, scaled_mechanics
 from wholearm_jax.phases import (
     Result,
     SimulatedPhase,
     certify_rest,
     final_configuration,
     initial_carry,
+    initial_loop_carry,
+    loop_step,
     phase_inputs,
     scan_step,
     trace_paths_in_one_program,
 )
-from wholearm_jax.simulation import IntegratorOptions
+from wholearm_jax.simulation import IntegratorOptions, phase_loop
 from wholearm_jax.tracing import ContactPath, Resolution
 
 
@@ -71,13 +73,13 @@ class _PhaseCheck(NamedTuple):
 
 
 def check_scene(
-    scene: Scene, schedule: TorqueSchedule, arrival, fidelity: Fidelity
+    scene: Scene, schedule: TorqueSchedule | LawTables, arrival, fidelity: Fidelity
 ) -> tuple[BatchResult, Int[Array, ""]]:
     """Check one scene at one fidelity.
 
     Args:
         scene: Scene whose phases all move the object.
-        schedule: Padded torque schedule (`model.pad_schedule`).
+        schedule: Padded torque schedule (`model.pad_schedule`), or closed-loop law.
         arrival: Distance from the path's end within which a phase must end, as a fraction of the path's length.
         fidelity: `COARSE_PASS` or `FINE_PASS`, with `has_jumps` set as the schedule requires.
 
@@ -89,9 +91,11 @@ def check_scene(
 
 
 def check_on_paths(
-    scene: Scene, paths: ContactPath, schedule: TorqueSchedule, arrival, fidelity: Fidelity
+    scene: Scene, paths: ContactPath, schedule: TorqueSchedule | LawTables, arrival, fidelity: Fidelity
 ) -> tuple[BatchResult, Int[Array, ""]]:
     """Check one scene whose `paths`, stacked over its phases, are traced."""
+    if isinstance(schedule, LawTables):
+        return _check_in_closed_loop(scene, paths, schedule, arrival, fidelity)
     body = rigid_body(scene.object)
 
     def check_phase(carry, phase):
@@ -104,6 +108,24 @@ def check_on_paths(
 
     phases = stack_trees([(phase_inputs(p), p.formation) for p in scene.phases])
     _, checks = jax.lax.scan(check_phase, initial_carry(schedule), (paths, *phases))
+    return _combine_phases(checks, len(scene.phases))
+
+
+def _check_in_closed_loop(scene: Scene, paths: ContactPath, law: LawTables, arrival, fidelity: Fidelity):
+    """Check one scene under a closed-loop law."""
+    body = rigid_body(scene.object)
+
+    def check_phase(carry, phase):
+        path, tables, inputs, formation = phase
+        mechanics = scaled_mechanics(body, scene.hand, scene.gravity, formation)
+        dynamics = tabulate_path_dynamics(mechanics, path)
+        loop = phase_loop(law, tables, dynamics)
+        carry, simulated = loop_step(law, fidelity.options, arrival, carry, (dynamics, loop, tables, *inputs))
+        certified = certify_rest(mechanics, dynamics, loop, simulated)
+        return carry, _summarise_phase(dynamics, simulated, formation, fidelity, certified)
+
+    phases = stack_trees([(phase_inputs(p), p.formation) for p in scene.phases])
+    _, checks = jax.lax.scan(check_phase, initial_loop_carry(law), (paths, law.phases, *phases))
     return _combine_phases(checks, len(scene.phases))
 
 

@@ -4,11 +4,12 @@ from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, IMPULSE_ROUNDIN
 from wholearm_jax.phases.closed_loop import (
     closed_loop_margin,
     closed_loop_options,
-    closed_loop_step,
     initial_loop_carry,
+    loop_step,
     require_phases,
     simulate_closed_loop,
 )
+from wholearm_jax.phases.closed_loop_result import closed_loop_result
 from wholearm_jax.phases.compressive_margin import margin
 from wholearm_jax.phases.gradients import check_gradient
 from wholearm_jax.phases.obstacles import describe_overlaps

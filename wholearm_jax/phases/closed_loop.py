@@ -5,6 +5,7 @@ path's end, be it that of another object's path. A phase that ends at a stop is 
 that the law's push holds it there is what the controller's design sees to.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -34,7 +35,7 @@ from wholearm_jax.tracing import Resolution
 
 CLOSED_LOOP_ARRIVAL = 0.01  # distance from the path's end within which a phase must end, in path lengths
 LANDING = 2.0  # speed at which an object may meet the stop that ends a phase, over that of the approach
-CLOSED_LOOP_STEPS = 512  # of a phase: the rows of its reference, twice, and the kinks of its gains
+CLOSED_LOOP_STEPS = 1024  # of a phase: the rows of its reference, twice, and the kinks of its gains
 CLOSED_LOOP_STAGES = 12  # smooth stages of a phase: a law may stop the object and start it again
 
 
@@ -49,29 +50,23 @@ class LoopCarry(NamedTuple):
 
 def closed_loop_options(options: IntegratorOptions) -> IntegratorOptions:
     """Return the options with room for the steps of a closed loop, whose reference may jump."""
-    return IntegratorOptions(
-        solver=options.solver,
-        tolerance=options.tolerance,
-        max_steps=max(options.max_steps, CLOSED_LOOP_STEPS),
-        max_stages=max(options.max_stages, CLOSED_LOOP_STAGES),
-        has_jumps=True,
-        adjoint=options.adjoint,
-    )
+    steps, stages = max(options.max_steps, CLOSED_LOOP_STEPS), max(options.max_stages, CLOSED_LOOP_STAGES)
+    return replace(options, max_steps=steps, max_stages=stages, has_jumps=True)
 
 
 def initial_loop_carry(law: LawTables) -> LoopCarry:
-    """Return the carry of `closed_loop_step` at a plan's start."""
+    """Return the carry of `loop_step` at a plan's start."""
     zero = jnp.zeros((), law.stiffness.dtype)
     return LoopCarry(zero, jnp.zeros(5, zero.dtype), zero, jnp.zeros(2, zero.dtype))
 
 
-def closed_loop_step(law: LawTables, options: IntegratorOptions, arrival, carry: LoopCarry, phase):
+def loop_step(law: LawTables, options: IntegratorOptions, arrival, carry: LoopCarry, phase):
     """Simulate the next phase of a plan under its law: one step of a scan.
 
-    `phase` is (dynamics, the phase's own law, *phase_inputs(phase)).
+    `phase` is (dynamics, its `phase_loop`, its tables, *phase_inputs(phase)).
     """
-    dynamics, tables, _, goal, is_left_moving = phase
-    loop, begin = phase_loop(law, tables, dynamics)
+    dynamics, loop, tables, _, goal, is_left_moving = phase
+    begin = place_on_path(loop, dynamics, jnp.zeros((), int), dynamics.breakpoints[0])
     duration = loop_duration(law, tables)
     speed = carry.speed * (carry.tangent @ tables.tangent[0])
     memory = jnp.stack([begin, speed, jnp.zeros_like(begin)])
@@ -127,12 +122,16 @@ def simulate_closed_loop(
     options = tolerance_as_data(closed_loop_options(options), law.stiffness.dtype)
     laws = unstack_trees(law.phases, law.count)
     for path, tables, phase in zip(traced, laws, scene.phases, strict=True):
-        carry, one = _jitted_step(law, options, arrival, carry, (path.dynamics, tables, *phase_inputs(phase)))
+        carry, one = _simulate_phase(law, options, arrival, carry, (path.dynamics, tables, *phase_inputs(phase)))
         found.append(one)
     return tuple(found)
 
 
-_jitted_step = CachedJit(closed_loop_step)
+@CachedJit
+def _simulate_phase(law: LawTables, options: IntegratorOptions, arrival, carry: LoopCarry, phase):
+    """Prepare the law of a phase, and simulate it."""
+    dynamics, tables, *inputs = phase
+    return loop_step(law, options, arrival, carry, (dynamics, phase_loop(law, tables, dynamics), tables, *inputs))
 
 
 def require_phases(scene: Scene, law: LawTables) -> None:

@@ -10,7 +10,7 @@ Derivation: section 4 of `docs/derivation.md`.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from wholearm_jax.core import fused_matmul, inverse_and_determinant, take_row
 from wholearm_jax.dynamics import PathDynamics, equations_of_motion, evaluate, locate_panel
@@ -25,24 +25,27 @@ from wholearm_jax.model import (
 )
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.result import MIN_REST
-from wholearm_jax.simulation import Motion
+from wholearm_jax.simulation import Drive, Motion, PhaseLoop, torque_of
 
 
 def certify_rest(
-    mechanics: ScaledMechanics, dynamics: PathDynamics, schedule: TorqueSchedule, done: SimulatedPhase
+    mechanics: ScaledMechanics, dynamics: PathDynamics, schedule: TorqueSchedule | PhaseLoop, done: SimulatedPhase
 ) -> Bool[Array, ""]:
-    """Whether every time that friction holds the object at rest in a phase is proved to be possible."""
+    """Whether every time that friction holds the object at rest in a phase is proved to be possible.
+
+    In closed loop the torque of a rest is taken to be linear within each step of the integrator.
+    """
     motion = done.motion
     rows = jnp.arange(motion.at_rest.shape[0])
     rests = motion.at_rest & (rows < motion.count) & (jnp.diff(motion.phase_time) > MIN_REST)
 
     def all_proved():
-        phase_schedule = restrict_to_phase(schedule, done.start, done.duration)
+        drive = schedule if isinstance(schedule, PhaseLoop) else restrict_to_phase(schedule, done.start, done.duration)
 
         def next_rest(at):
             left, _ = at
             k = jnp.argmax(left)
-            return left.at[k].set(False), _certify_interval(mechanics, dynamics, phase_schedule, motion, k)
+            return left.at[k].set(False), _certify_interval(mechanics, dynamics, drive, motion, k)
 
         return jax.lax.while_loop(lambda at: at[1] & at[0].any(), next_rest, (rests, jnp.asarray(True)))[1]
 
@@ -50,7 +53,7 @@ def certify_rest(
 
 
 def _certify_interval(
-    mechanics: ScaledMechanics, dynamics: PathDynamics, phase_schedule: PhaseSchedule, motion: Motion, k
+    mechanics: ScaledMechanics, dynamics: PathDynamics, drive: Drive, motion: Motion, k
 ) -> Bool[Array, ""]:
     """Whether one rest, step `k` of a motion, is."""
     segment, begin, end = (
@@ -67,6 +70,20 @@ def _certify_interval(
     sliding = -take_row(dynamics.friction_ratio, segment) / jnp.where(
         friction > 0, friction, 1.0
     )  # signs of slip, as traced
+    torques = _loop_torques(drive, motion, k) if isinstance(drive, PhaseLoop) else _rest_torques(drive, begin, end)
+    corners = torques / mechanics.torque_unit
+    terms = jnp.concatenate([jnp.ones_like(corners[:, :1]), corners], axis=1)
+
+    def within(sign):
+        matrix, right = equations_of_motion(mechanics, z, x, jnp.zeros_like(x), sign * sliding, sign * jnp.sign(x[3:]))
+        solved = fused_matmul(inverse_and_determinant(matrix)[0], right[:, jnp.array([0, 3, 4])])[1:]
+        return jax.vmap(lambda one: force_slack(dynamics, fused_matmul(solved, one)))(terms).min() >= 0
+
+    return jax.lax.map(within, jnp.array([1.0, -1.0])).all()
+
+
+def _rest_torques(phase_schedule: PhaseSchedule, begin, end) -> Float[Array, "corners 2"]:
+    """Return torques whose convex hull holds all those of a rest."""
     # At a step the torque is that before it where a rest ends, and that behind it where one begins.
     near = TIME_ROUNDING * jnp.finfo(end.dtype).eps
     first, last = (
@@ -76,14 +93,12 @@ def _certify_interval(
     rows = (jnp.clip(row, phase_schedule.first, phase_schedule.last) for row in (first, last))
     ends = jnp.stack([torque_at(phase_schedule, row, at) for row, at in zip(rows, (begin, end), strict=True)])
     inside = (phase_schedule.phase_time > begin + near) & (phase_schedule.phase_time < end - near)
-    corners = (
-        jnp.concatenate([ends, jnp.where(inside[:, None], phase_schedule.values, ends[0])]) / mechanics.torque_unit
-    )
-    terms = jnp.concatenate([jnp.ones_like(corners[:, :1]), corners], axis=1)
+    return jnp.concatenate([ends, jnp.where(inside[:, None], phase_schedule.values, ends[0])])
 
-    def within(sign):
-        matrix, right = equations_of_motion(mechanics, z, x, jnp.zeros_like(x), sign * sliding, sign * jnp.sign(x[3:]))
-        solved = fused_matmul(inverse_and_determinant(matrix)[0], right[:, jnp.array([0, 3, 4])])[1:]
-        return jax.vmap(lambda one: force_slack(dynamics, fused_matmul(solved, one)))(terms).min() >= 0
 
-    return jax.lax.map(within, jnp.array([1.0, -1.0])).all()
+def _loop_torques(loop: PhaseLoop, motion: Motion, k) -> Float[Array, "corners 2"]:
+    """Return the torques of a closed loop where a rest, step `k` of a motion, begins and ends."""
+    assert motion.memory is not None
+    nodes = jnp.stack([k, k + 1])
+    row = take_row(motion.row, k)
+    return jax.vmap(torque_of, (None, None, 0, 0))(loop, row, motion.phase_time[nodes], motion.memory[nodes])

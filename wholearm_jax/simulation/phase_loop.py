@@ -19,7 +19,7 @@ def loop_duration(law: LawTables, phase: PhaseTables) -> Float[Array, ""]:
     return phase.time[-1] + jnp.where(waits, law.patience, 0.0)
 
 
-def phase_loop(law: LawTables, phase: PhaseTables, dynamics: PathDynamics) -> tuple[PhaseLoop, Float[Array, ""]]:
+def phase_loop(law: LawTables, phase: PhaseTables, dynamics: PathDynamics) -> PhaseLoop:
     """Prepare the law of one phase for the path of a scene.
 
     Args:
@@ -28,8 +28,7 @@ def phase_loop(law: LawTables, phase: PhaseTables, dynamics: PathDynamics) -> tu
         dynamics: Tabulated path dynamics of the scene.
 
     Returns:
-        The law in phase time, of which one unit is `loop_duration`, and the place [rad] of the joint angles at the
-        path's start.
+        The law in phase time, of which one unit is `loop_duration`.
     """
     place = _place_along_path(phase, dynamics)
     begin = evaluate_polynomial(place[dynamics.first[0]], -jnp.ones_like(phase.length))
@@ -37,7 +36,7 @@ def phase_loop(law: LawTables, phase: PhaseTables, dynamics: PathDynamics) -> tu
     times, first, last, presses = _reference_rows(phase, begin - phase.s_ref[0], duration)
     gap = jnp.diff(times)
     slope = jnp.where((gap > 0)[:, None], (last - first) / jnp.where(gap > 0, gap, 1.0)[:, None], 0.0) * duration
-    loop = PhaseLoop(
+    return PhaseLoop(
         phase_time=times / duration,
         reference=first,
         slope=slope,
@@ -54,7 +53,6 @@ def phase_loop(law: LawTables, phase: PhaseTables, dynamics: PathDynamics) -> tu
         press=phase.press,
         torque_limit=law.torque_limit,
     )
-    return loop, begin
 
 
 def _reference_rows(phase: PhaseTables, offset, duration):

@@ -1,0 +1,80 @@
+"""The simulation of a plan in closed loop as a `Result`, with the torques that the law has exerted as its schedule."""
+
+import jax
+import numpy as np
+
+from wholearm_jax.core import Status, as_device_array, on_host, require_positive, require_x64
+from wholearm_jax.model import LawTables, Scene, TorqueSchedule, uniform_schedule
+from wholearm_jax.phases.closed_loop import CLOSED_LOOP_ARRIVAL, CLOSED_LOOP_STEPS, simulate_closed_loop
+from wholearm_jax.phases.phase_simulation import SimulatedPhase
+from wholearm_jax.phases.phase_tracing import TracedPhase
+from wholearm_jax.phases.plan_schedule import require_motion
+from wholearm_jax.phases.plan_tracing import trace
+from wholearm_jax.phases.result import Result, build_result
+from wholearm_jax.simulation import IntegratorOptions, PhaseLoop, phase_loop, torque_of
+
+MAX_CLOSED_LOOP_STEPS = 16384  # a phase, beyond which nothing is tried again
+
+
+@on_host("wholearm_jax.phases.closed_loop_margin is the margin as a number that can be transformed")
+def closed_loop_result(
+    scene: Scene,
+    law: LawTables,
+    *,
+    tolerance: float = 1e-9,
+    traced: tuple[TracedPhase, ...] = (),
+    arrival: float = CLOSED_LOOP_ARRIVAL,
+) -> Result:
+    """Simulate a plan in closed loop, and assess every phase, as `simulate` does under a schedule.
+
+    Args:
+        scene: Scene with its plan.
+        law: The controller's tables (`feedback.law_tables`).
+        tolerance: Tolerance of the integrator.
+        traced: Result of `trace`, to reuse.
+        arrival: Distance from its path's end within which a phase must end, in path lengths.
+
+    Returns:
+        The result; its `torque` is what the law has exerted, at the ends of the integrator's steps.
+
+    Raises:
+        ValueError: For a law of another number of phases, a phase that holds the object, or numbers that are not
+            positive.
+    """
+    require_x64(scene, law)
+    require_positive(tolerance=tolerance, arrival=arrival)
+    require_motion(scene)
+    traced, steps = traced or trace(scene), CLOSED_LOOP_STEPS
+    while True:
+        options = IntegratorOptions(tolerance=tolerance, max_steps=steps, max_stages=max(12, steps // 64))
+        phases = simulate_closed_loop(scene, law, traced, options, arrival)
+        used_up = any(int(one.assessment.status) == Status.MAX_STEPS for one in phases)
+        if not used_up or steps >= MAX_CLOSED_LOOP_STEPS:
+            return build_result(scene, _exerted(law, traced, phases), traced, phases)
+        steps *= 4
+
+
+def _exerted(law: LawTables, traced: tuple[TracedPhase, ...], phases: tuple[SimulatedPhase, ...]) -> TorqueSchedule:
+    """Return the torques of the law where the steps of a motion begin and end."""
+    times, torques = [], []
+    for k, (path, one) in enumerate(zip(traced, phases, strict=True)):
+        motion, count = one.motion, int(one.motion.count)
+        if count == 0 or int(path.dynamics.status) != Status.OK:
+            continue
+        tables = jax.tree.map(lambda leaf, k=k: leaf[k], law.phases)
+        both = _step_torques(phase_loop(law, tables, path.dynamics), motion)
+        nodes = np.stack([np.asarray(motion.phase_time[:-1]), np.asarray(motion.phase_time[1:])], axis=1)[:count]
+        times.append(float(one.start) + float(one.duration) * nodes.ravel())
+        torques.append(np.asarray(both)[:count].reshape(-1, 2))
+    if not times:
+        return uniform_schedule(1.0, np.zeros((2, 2)))
+    return TorqueSchedule(as_device_array(np.concatenate(times)), as_device_array(np.concatenate(torques)))
+
+
+@jax.jit
+def _step_torques(loop: PhaseLoop, motion):
+    """Evaluate the torque at both ends of every step: (steps, 2, 2)."""
+    each = jax.vmap(torque_of, (None, 0, 0, 0))
+    begin = each(loop, motion.row, motion.phase_time[:-1], motion.memory[:-1])
+    end = each(loop, motion.row, motion.phase_time[1:], motion.memory[1:])
+    return jax.numpy.stack([begin, end], axis=1)
