@@ -23,6 +23,7 @@ from wholearm_jax.ensembles.scene_check import COARSE_PASS, FINE_PASS, BatchResu
 from wholearm_jax.feedback import Controller, law_tables, require_same_plan
 from wholearm_jax.model import LawTables, Scene, TorqueSchedule, pad_schedule
 from wholearm_jax.phases import (
+    CLOSED_LOOP_STEPS,
     closed_loop_options,
     closed_loop_result,
     has_torque_jumps,
@@ -35,6 +36,7 @@ from wholearm_jax.phases import (
 CHUNK = 4096  # scenes whose results are kept together
 BATCH_ARRIVAL = 0.01  # fraction of the path: scenes that vary cannot end exactly where the nominal scene must
 LOOP_TOLERANCE = 1e-7  # least tolerance of the integrator in closed loop: a law makes errors fade
+LOOP_STEPS = 320  # of a phase in closed loop, in the first pass
 MIN_COARSE_TOLERANCE = 1e-9  # [N], smaller tolerances begin at the full resolution
 
 
@@ -68,8 +70,8 @@ def check(
         Status, margin, time, contact, phase and end pose of each scene. A scene that fails never raises.
 
     Raises:
-        ValueError: For one scene that is not stacked, a controller of another plan, a schedule shorter than a plan, a number that is not positive, or
-            a `count` of more scenes than are given.
+        ValueError: For one scene that is not stacked, a controller of another plan, a schedule shorter than a plan, a
+            number that is not positive, or a `count` of more scenes than are given.
     """
     if isinstance(scenes, Scene) and np.ndim(scenes.object.mass) == 0:
         raise ValueError("this is one scene: check [scene], or vary it (wholearm_jax.ensembles.make_ensemble)")
@@ -102,7 +104,8 @@ def check_in_chunks(
 ) -> Iterator[tuple[int, BatchResult]]:
     """Check scenes one chunk after the other, and yield each chunk's number and results.
 
-    `torque` may be a closed-loop law; `chunk_numbers` selects chunks and their order (default: all); the other arguments are those of `check`.
+    `torque` may be a closed-loop law; `chunk_numbers` selects chunks and their order (default: all); the other arguments
+    are those of `check`.
     """
     require_x64(source.nominal, torque)
     require_positive(count=count, tolerance=tolerance, arrival=arrival, chunk=chunk)
@@ -152,7 +155,8 @@ def _fidelity_for(nominal: Scene, torque: TorqueSchedule | LawTables, fidelity: 
     """Return the fidelity with the options that a schedule, or a law, requires."""
     if isinstance(torque, LawTables):
         tolerance = max(fidelity.options.tolerance, LOOP_TOLERANCE)
-        options = replace(closed_loop_options(fidelity.options), tolerance=tolerance)
+        steps = LOOP_STEPS if fidelity is COARSE_PASS else CLOSED_LOOP_STEPS
+        options = closed_loop_options(replace(fidelity.options, tolerance=tolerance), steps)
     else:
         options = replace(fidelity.options, has_jumps=has_torque_jumps(nominal, torque))
     return fidelity._replace(options=options)

@@ -4,7 +4,8 @@ import numpy as np
 
 from wholearm_jax.core import as_device_array
 from wholearm_jax.feedback.controller import Controller
-from wholearm_jax.model import LawTables, PhaseTables, Scene
+from wholearm_jax.model import LawTables, PhaseTables, Scene, round_up
+from wholearm_jax.simulation import SEARCH_BLOCK
 
 
 def law_tables(controller: Controller) -> LawTables:
@@ -17,7 +18,8 @@ def law_tables(controller: Controller) -> LawTables:
         The law for `check`, and for `closed_loop_margin`, which can be differentiated with respect to it.
     """
     phases = controller.phases
-    nodes, times = max(len(phase.s) for phase in phases), max(len(phase.time) for phase in phases)
+    nodes = round_up(max(len(phase.s) for phase in phases), SEARCH_BLOCK)
+    times = max(len(phase.time) for phase in phases)
 
     def along(name: str):
         return _stack([_repeat_last(getattr(phase, name), nodes) for phase in phases])

@@ -48,9 +48,9 @@ class LoopCarry(NamedTuple):
     tangent: Float[Array, "2"]  # of the law's curve at its end
 
 
-def closed_loop_options(options: IntegratorOptions) -> IntegratorOptions:
+def closed_loop_options(options: IntegratorOptions, steps: int = CLOSED_LOOP_STEPS) -> IntegratorOptions:
     """Return the options with room for the steps of a closed loop, whose reference may jump."""
-    steps, stages = max(options.max_steps, CLOSED_LOOP_STEPS), max(options.max_stages, CLOSED_LOOP_STAGES)
+    steps, stages = max(options.max_steps, steps), max(options.max_stages, CLOSED_LOOP_STAGES)
     return replace(options, max_steps=steps, max_stages=stages, has_jumps=True)
 
 

@@ -9,6 +9,7 @@ Along a path `q` is a function of the path's own parameter; the torque is one of
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
@@ -17,7 +18,7 @@ from wholearm_jax.core import take_row
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.model import PhaseSchedule, torque_at
 
-MEMORY = 3  # numbers that the law remembers
+SEARCH_BLOCK = 16  # rows of a block, in tables whose length is a multiple of it
 
 
 class PhaseLoop(eqx.Module):
@@ -54,11 +55,19 @@ Drive = PhaseSchedule | PhaseLoop
 
 def interpolate_rows(places: Float[Array, "rows"], values: Float[Array, "rows *shape"], at) -> Float[Array, "*shape"]:
     """Interpolate a table linearly; it is constant beyond its ends."""
-    k = jnp.clip((stop_gradient(at) >= places).sum() - 1, 0, places.shape[0] - 2)
+    k = jnp.clip(_row_before(places, stop_gradient(at)), 0, places.shape[0] - 2)
     begin, end = take_row(places, k), take_row(places, k + 1)
     share = jnp.clip((at - begin) / jnp.where(end > begin, end - begin, 1.0), 0.0, 1.0)
     low, high = take_row(values, k), take_row(values, k + 1)
     return low + share * (high - low)
+
+
+def _row_before(places: Float[Array, "rows"], at) -> Int[Array, ""]:
+    """Return the last row at or before a place (-1: none): of a long table its block first, then the row in it."""
+    if places.shape[0] % SEARCH_BLOCK:
+        return (at >= places).sum() - 1
+    block = jnp.maximum((at >= places[::SEARCH_BLOCK]).sum() - 1, 0) * SEARCH_BLOCK
+    return block + (at >= jax.lax.dynamic_slice_in_dim(places, block, SEARCH_BLOCK)).sum() - 1
 
 
 def _act(loop: PhaseLoop, row, phase_time, memory):
