@@ -3,8 +3,6 @@
 from dataclasses import replace
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,7 +11,7 @@ from tests.reference import unreduced
 from tests.reference.closed_loop import ClosedLoop
 from wholearm_jax.feedback import law_tables
 from wholearm_jax.files import controller_to_dict, scene_toml
-from wholearm_jax.phases import closed_loop_margin, configuration, simulate_closed_loop
+from wholearm_jax.phases import configuration, simulate_closed_loop
 from wholearm_jax.simulation import IntegratorOptions
 
 FRICTION = np.array([1.1, 0.95, 1.15])  # of each link, over the scene's

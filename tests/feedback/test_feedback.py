@@ -16,16 +16,6 @@ from wholearm_jax.feedback import begin, step
 
 
 @pytest.fixture(scope="module")
-def scene():
-    return wa.load("heptagon")
-
-
-@pytest.fixture(scope="module")
-def controller(scene):
-    return wa.feedback(scene, wa.quasistatic(scene), friction=0.2)
-
-
-@pytest.fixture(scope="module")
 def path(controller, tmp_path_factory):
     path = tmp_path_factory.mktemp("controller") / "controller.json"
     wa.write_controller(controller, path)

@@ -103,7 +103,7 @@ def _predict(name: str, scene, torque: Path | None, controller: Path | None):
 
     That of a controller is the plan under the quasi-static torques: where the paths begin and end is the same for all.
     """
-    from wholearm_jax.execution import require_same_plan
+    from wholearm_jax.feedback import require_same_plan
     from wholearm_jax.files import read_controller, read_torque
     from wholearm_jax.optimisation import quasistatic
 

@@ -24,6 +24,7 @@ from wholearm_jax.feedback import Controller, law_tables, require_same_plan
 from wholearm_jax.model import LawTables, Scene, TorqueSchedule, pad_schedule
 from wholearm_jax.phases import (
     CLOSED_LOOP_STEPS,
+    Result,
     closed_loop_options,
     closed_loop_result,
     has_torque_jumps,
@@ -86,8 +87,10 @@ def check(
         count = source.count
     elif isinstance(source, SceneBatch) and count > source.count:
         raise ValueError(f"count is {count}, but {source.count} scenes are given")
-    drive = choose_drive(source, torque, controller)
-    chunks = check_in_chunks(source, drive, count, tolerance=tolerance, arrival=arrival, chunk=chunk, devices=devices)
+    actuation = choose_actuation(source, torque, controller)
+    chunks = check_in_chunks(
+        source, actuation, count, tolerance=tolerance, arrival=arrival, chunk=chunk, devices=devices
+    )
     return BatchResult(*(np.concatenate(column) for column in zip(*(part for _, part in chunks), strict=True)))
 
 
@@ -104,8 +107,8 @@ def check_in_chunks(
 ) -> Iterator[tuple[int, BatchResult]]:
     """Check scenes one chunk after the other, and yield each chunk's number and results.
 
-    `torque` may be a closed-loop law; `chunk_numbers` selects chunks and their order (default: all); the other arguments
-    are those of `check`.
+    `torque` may be a closed-loop law; `chunk_numbers` selects chunks and their order (default: all); the other
+    arguments are those of `check`.
     """
     require_x64(source.nominal, torque)
     require_positive(count=count, tolerance=tolerance, arrival=arrival, chunk=chunk)
@@ -145,10 +148,16 @@ def _check_chunk(
             break
     assert results is not None
     for row in np.concatenate([*single, rows]):
-        simulated = closed_loop_result if isinstance(torque, LawTables) else simulate  # refines until all is fine
-        result = simulated(source.draw(jnp.asarray(numbers[row])), torque, arrival=float(arrival))
+        result = _simulate_alone(source.draw(jnp.asarray(numbers[row])), torque, float(arrival))
         _overwrite(results, row, from_result(result))
     return results
+
+
+def _simulate_alone(scene: Scene, torque: TorqueSchedule | LawTables, arrival: float) -> Result:
+    """Simulate one scene, refined until all is fine."""
+    if isinstance(torque, LawTables):
+        return closed_loop_result(scene, torque, arrival=arrival)
+    return simulate(scene, torque, arrival=arrival)
 
 
 def _fidelity_for(nominal: Scene, torque: TorqueSchedule | LawTables, fidelity: Fidelity) -> Fidelity:
@@ -162,7 +171,7 @@ def _fidelity_for(nominal: Scene, torque: TorqueSchedule | LawTables, fidelity: 
     return fidelity._replace(options=options)
 
 
-def choose_drive(
+def choose_actuation(
     source: SceneSource, torque: TorqueSchedule | None, controller: Controller | LawTables | None
 ) -> TorqueSchedule | LawTables:
     """Return the schedule or the law that drives the scenes; raises ValueError unless there is one of them."""

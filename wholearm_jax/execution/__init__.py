@@ -1,6 +1,6 @@
 """Virtual hardware: a MuJoCo model with Coulomb friction, rollouts, trials. Needs the extra `mujoco`."""
 
-from wholearm_jax.execution.closed_loop import IDEAL, Hardware, require_same_plan
+from wholearm_jax.execution.closed_loop import IDEAL, Hardware
 from wholearm_jax.execution.executions import (
     Execution,
     ExecutionOutcome,
@@ -39,7 +39,6 @@ __all__ = [
     "execute",
     "motor_torques",
     "require_objects",
-    "require_same_plan",
     "require_wires",
     "rollout_in_parallel",
     "run_trials",

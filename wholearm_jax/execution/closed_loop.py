@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from wholearm_jax.core import require_positive
-from wholearm_jax.feedback import Controller, begin
+from wholearm_jax.feedback import Controller, begin, require_same_plan
 from wholearm_jax.feedback import step as law_step
 from wholearm_jax.model import Scene
 
@@ -39,14 +39,6 @@ def require_hardware(hardware: Hardware) -> None:
     require_positive(rate=hardware.rate)
     if hardware.delay < 0 or hardware.counts < 0 or hardware.torque_noise < 0:
         raise ValueError("delay, counts, torque_noise: must not be negative")
-
-
-def require_same_plan(controller: Controller, scene: Scene) -> None:
-    """Raise ValueError where a controller is for other contact formations than a scene's."""
-    ours = [phase.formation.names for phase in scene.phases]
-    theirs = [phase.contacts for phase in controller.phases]
-    if ours != theirs:
-        raise ValueError(f"the controller is for another plan ('{controller.title}'): its contact formations differ")
 
 
 def closed_loop_step(controller: Controller, hardware: Hardware, scene: Scene, timestep: float) -> float:

@@ -11,14 +11,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from wholearm_jax.dynamics import PathDynamics, evaluate_dot, locate_panel
-from wholearm_jax.simulation import DenseOutput, Drive, evaluate_dense, evaluate_memory, torque_of
+from wholearm_jax.simulation import Actuation, DenseOutput, evaluate_dense, evaluate_memory, torque_of
 
 SAMPLES_PER_STEP = 7  # places in a step at which forces are sampled before the minimum is refined
 MAX_ROLLING = 2  # contacts of a formation that can roll: 2R + S = 4
 
 
 def contact_force(
-    dynamics: PathDynamics, phase_schedule: Drive, duration, segment, row, phase_time, s, w, memory=None
+    dynamics: PathDynamics, phase_schedule: Actuation, duration, segment, row, phase_time, s, w, memory=None
 ) -> Float[Array, "rows"]:
     """Evaluate the constraint forces [N] for forward travel: `c_n`, or `c_t` in tangential rows.
 
@@ -67,7 +67,7 @@ def is_duplicate_facet(dynamics: PathDynamics) -> Bool[Array, "rows"]:
 
 
 def slacks_at(
-    dynamics: PathDynamics, phase_schedule: Drive, duration, step: DenseOutput, xi, kind=force_slack
+    dynamics: PathDynamics, phase_schedule: Actuation, duration, step: DenseOutput, xi, kind=force_slack
 ) -> Float[Array, "rows"]:
     """Evaluate `force_slack` (or `cone_facets`) at `xi` in [0, 1] of one step."""
     phase_time, s, w = evaluate_dense(step, xi)
@@ -77,7 +77,7 @@ def slacks_at(
 
 def sampled_slacks(
     dynamics: PathDynamics,
-    phase_schedule: Drive,
+    phase_schedule: Actuation,
     duration,
     steps: DenseOutput,
     samples: int = SAMPLES_PER_STEP,

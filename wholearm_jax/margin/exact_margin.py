@@ -16,7 +16,7 @@ from wholearm_jax.core import take_row
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.margin.contact_forces import SAMPLES_PER_STEP, sampled_slacks, slacks_at
 from wholearm_jax.margin.refinement import golden_section, refine_minimum, with_envelope_derivative
-from wholearm_jax.simulation import DenseOutput, Drive, IntegratorOptions, Motion, dense_output, evaluate_dense
+from wholearm_jax.simulation import Actuation, DenseOutput, IntegratorOptions, Motion, dense_output, evaluate_dense
 
 MAX_REFINED = 4  # candidates refined: those that parabolas through samples put lowest
 SAMPLED_STEPS = 16  # steps sampled together
@@ -36,7 +36,7 @@ class MarginResult(NamedTuple):
 
 def minimum_margin(
     dynamics: PathDynamics,
-    phase_schedule: Drive,
+    phase_schedule: Actuation,
     duration: Float[Array, ""],
     motion: Motion,
     options: IntegratorOptions,

@@ -1,6 +1,7 @@
 """Torque schedules: two joint torques over time, linear between rows; a repeated time is a step."""
 
 from functools import partial
+from typing import Protocol
 
 import equinox as eqx
 import jax
@@ -170,7 +171,18 @@ def restrict_to_phase(schedule: TorqueSchedule, start: Float[Array, ""], duratio
     )
 
 
-def interval(phase_schedule: PhaseSchedule, phase_time: Float[Array, ""]) -> Int[Array, ""]:
+class HasIntervals(Protocol):
+    """What has intervals over phase time: a schedule, or a closed-loop law."""
+
+    @property
+    def phase_time(self) -> Float[Array, "rows"]: ...
+    @property
+    def first(self) -> Int[Array, ""]: ...
+    @property
+    def last(self) -> Int[Array, ""]: ...
+
+
+def interval(phase_schedule: HasIntervals, phase_time: Float[Array, ""]) -> Int[Array, ""]:
     """Return the interval of a normalised time; a jump belongs to the interval after it, except at the phase's end."""
     return jnp.clip((phase_time >= phase_schedule.phase_time).sum() - 1, phase_schedule.first, phase_schedule.last)
 

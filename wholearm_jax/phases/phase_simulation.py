@@ -16,7 +16,7 @@ from wholearm_jax.margin import MarginResult, minimum_margin
 from wholearm_jax.model import Arrival, TorqueSchedule, restrict_to_phase, uniform_schedule
 from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL, Assessment, assess_phase
 from wholearm_jax.phases.phase_tracing import MIN_LENGTH
-from wholearm_jax.simulation import Drive, IntegratorOptions, Motion, simulate_motion, tolerance_as_data
+from wholearm_jax.simulation import Actuation, IntegratorOptions, Motion, simulate_motion, tolerance_as_data
 from wholearm_jax.tracing import Resolution
 
 
@@ -82,7 +82,7 @@ def _simulate_phase(
 
 def simulate_under(
     dynamics: PathDynamics,
-    drive: Drive,
+    actuation: Actuation,
     start,
     duration,
     incoming_velocity,
@@ -99,10 +99,10 @@ def simulate_under(
     # Enter the phase and integrate its motion.
     impact = resolve_impact(dynamics, incoming_velocity)
     speed = jnp.maximum(impact.speed, 0.0)
-    motion = simulate_motion(dynamics, drive, duration, options=options, speed=speed, memory=memory)
+    motion = simulate_motion(dynamics, actuation, duration, options=options, speed=speed, memory=memory)
     # Compute the margin: unknown for part of a motion, and without a path. A path whose start lies beyond an edge of
     # its formation, be it by rounding, is as good as any beside it.
-    margin_result = minimum_margin(dynamics, drive, duration, motion, options)
+    margin_result = minimum_margin(dynamics, actuation, duration, motion, options)
     starts_beyond = (dynamics.status == int(Status.LEFT_FORMATION)) & (dynamics.length > MIN_LENGTH)
     has_path = (dynamics.status == int(Status.OK)) | starts_beyond
     is_known = has_path & (motion.status != int(Status.MAX_STEPS))

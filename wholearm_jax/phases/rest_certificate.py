@@ -25,7 +25,7 @@ from wholearm_jax.model import (
 )
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.result import MIN_REST
-from wholearm_jax.simulation import Drive, Motion, PhaseLoop, torque_of
+from wholearm_jax.simulation import Actuation, Motion, PhaseLoop, torque_of
 
 
 def certify_rest(
@@ -40,12 +40,14 @@ def certify_rest(
     rests = motion.at_rest & (rows < motion.count) & (jnp.diff(motion.phase_time) > MIN_REST)
 
     def all_proved():
-        drive = schedule if isinstance(schedule, PhaseLoop) else restrict_to_phase(schedule, done.start, done.duration)
+        actuation = (
+            schedule if isinstance(schedule, PhaseLoop) else restrict_to_phase(schedule, done.start, done.duration)
+        )
 
         def next_rest(at):
             left, _ = at
             k = jnp.argmax(left)
-            return left.at[k].set(False), _certify_interval(mechanics, dynamics, drive, motion, k)
+            return left.at[k].set(False), _certify_interval(mechanics, dynamics, actuation, motion, k)
 
         return jax.lax.while_loop(lambda at: at[1] & at[0].any(), next_rest, (rests, jnp.asarray(True)))[1]
 
@@ -53,7 +55,7 @@ def certify_rest(
 
 
 def _certify_interval(
-    mechanics: ScaledMechanics, dynamics: PathDynamics, drive: Drive, motion: Motion, k
+    mechanics: ScaledMechanics, dynamics: PathDynamics, actuation: Actuation, motion: Motion, k
 ) -> Bool[Array, ""]:
     """Whether one rest, step `k` of a motion, is."""
     segment, begin, end = (
@@ -70,7 +72,11 @@ def _certify_interval(
     sliding = -take_row(dynamics.friction_ratio, segment) / jnp.where(
         friction > 0, friction, 1.0
     )  # signs of slip, as traced
-    torques = _loop_torques(drive, motion, k) if isinstance(drive, PhaseLoop) else _rest_torques(drive, begin, end)
+    torques = (
+        _loop_torques(actuation, motion, k)
+        if isinstance(actuation, PhaseLoop)
+        else _rest_torques(actuation, begin, end)
+    )
     corners = torques / mechanics.torque_unit
     terms = jnp.concatenate([jnp.ones_like(corners[:, :1]), corners], axis=1)
 

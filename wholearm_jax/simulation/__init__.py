@@ -1,6 +1,13 @@
 """The motion of one phase: adaptive steps that end on events."""
 
-from wholearm_jax.simulation.closed_loop import SEARCH_BLOCK, Drive, PhaseLoop, memory_rate, place_on_path, torque_of
+from wholearm_jax.simulation.closed_loop import (
+    SEARCH_BLOCK,
+    Actuation,
+    PhaseLoop,
+    memory_rate,
+    place_on_path,
+    torque_of,
+)
 from wholearm_jax.simulation.integrator import TerminalEvent, integrate_adaptive
 from wholearm_jax.simulation.integrator_options import Adjoint, IntegratorOptions, tolerance_as_data, with_step_capacity
 from wholearm_jax.simulation.interpolation import (

@@ -49,7 +49,7 @@ class PhaseLoop(eqx.Module):
     torque_limit: Float[Array, "2"]
 
 
-Drive = PhaseSchedule | PhaseLoop
+Actuation = PhaseSchedule | PhaseLoop
 """What gives the torques of a phase."""
 
 
@@ -84,20 +84,20 @@ def _act(loop: PhaseLoop, row, phase_time, memory):
     return now[2:], gain, jnp.minimum(jnp.maximum(wanted, -most), ahead), is_cut, error
 
 
-def torque_of(drive: Drive, row, phase_time, memory=None) -> Float[Array, "2"]:
+def torque_of(actuation: Actuation, row, phase_time, memory=None) -> Float[Array, "2"]:
     """Evaluate the torque [N m] of a schedule, or of a law with its memory, in an interval."""
-    if not isinstance(drive, PhaseLoop):
-        return torque_at(drive, row, phase_time)
-    torque, gain, acceleration, _, _ = _act(drive, row, phase_time, memory)
-    return jnp.clip(torque + gain * acceleration, -drive.torque_limit, drive.torque_limit)
+    if not isinstance(actuation, PhaseLoop):
+        return torque_at(actuation, row, phase_time)
+    torque, gain, acceleration, _, _ = _act(actuation, row, phase_time, memory)
+    return jnp.clip(torque + gain * acceleration, -actuation.torque_limit, actuation.torque_limit)
 
 
-def memory_rate(drive: PhaseLoop, dynamics: PathDynamics, duration, segment, row, phase_time, s, memory):
+def memory_rate(actuation: PhaseLoop, dynamics: PathDynamics, duration, segment, row, phase_time, s, memory):
     """Evaluate the rate of the memory in phase time, where the path's parameter is `s`."""
-    off = place_on_path(drive, dynamics, segment, s) - memory[0]
-    *_, is_cut, error = _act(drive, row, phase_time, memory)
-    integral = jnp.where(is_cut, 0.0, drive.integral * error)
-    return duration * jnp.stack([memory[1] + 2 * drive.observer * off, drive.observer**2 * off, integral])
+    off = place_on_path(actuation, dynamics, segment, s) - memory[0]
+    *_, is_cut, error = _act(actuation, row, phase_time, memory)
+    integral = jnp.where(is_cut, 0.0, actuation.integral * error)
+    return duration * jnp.stack([memory[1] + 2 * actuation.observer * off, actuation.observer**2 * off, integral])
 
 
 def place_on_path(loop: PhaseLoop, dynamics: PathDynamics, segment, s) -> Float[Array, ""]:

@@ -51,6 +51,7 @@ def rest_until_departure(
         is_resting: Whether it rests; else nothing happens.
     """
     dynamics, loop, duration = ode
+    assert isinstance(loop, PhaseLoop)
     panel, xi = locate_panel(dynamics, segment, s)
     forward = evaluate(dynamics.acceleration, panel, xi)[jnp.array([0, 3, 4])]
     terms = jnp.stack([forward, -evaluate(dynamics.reverse_acceleration, panel, xi)])

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import take_row
 from wholearm_jax.model import interval
-from wholearm_jax.simulation.closed_loop import Drive
+from wholearm_jax.simulation.closed_loop import Actuation
 from wholearm_jax.simulation.integrator_options import IntegratorOptions, solver_with_loop
 
 MAX_FIRST_STEP = 1 / 32  # of the phase
@@ -72,7 +72,7 @@ class _Method(NamedTuple):
 
 def integrate_adaptive(
     field: Callable,
-    phase_schedule: Drive,
+    phase_schedule: Actuation,
     options: IntegratorOptions,
     begin: Float[Array, ""],
     final: Float[Array, ""],
@@ -143,7 +143,7 @@ def _method(field: Callable, options: IntegratorOptions) -> _Method:
 
 
 def _initial_state(
-    method: _Method, phase_schedule: Drive, options: IntegratorOptions, begin, final, y, distance
+    method: _Method, phase_schedule: Actuation, options: IntegratorOptions, begin, final, y, distance
 ) -> _IntegratorState:
     """Choose the first step, and make room for `max_steps` steps."""
     half_way = jnp.where(y[1] > 0, distance / jnp.where(y[1] > 0, 2 * y[1], 1.0), 1.0)
@@ -165,7 +165,7 @@ def _initial_state(
     return _IntegratorState(begin, end, size, row, y, made_jump, solver_state, controller_state, attempts, no_steps)
 
 
-def _step_end(phase_schedule: Drive, final, begin, size, row):
+def _step_end(phase_schedule: Actuation, final, begin, size, row):
     """Return where a step ends: on the end of its interval of the schedule, rather than beyond or just before it."""
     knot = jnp.minimum(jnp.where(row < phase_schedule.last, take_row(phase_schedule.phase_time, row + 1), final), final)
     return jnp.where(begin + size > knot - 100 * jnp.finfo(size.dtype).eps, knot, begin + size)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.dynamics import PathDynamics, differentiate_polynomial, evaluate_polynomial
-from wholearm_jax.simulation.closed_loop import Drive, PhaseLoop, memory_rate
+from wholearm_jax.simulation.closed_loop import Actuation, PhaseLoop, memory_rate
 from wholearm_jax.simulation.motion_record import Motion
 from wholearm_jax.simulation.path_ode import path_acceleration
 
@@ -30,7 +30,7 @@ class DenseOutput(eqx.Module):
 
 
 def dense_output(
-    dynamics: PathDynamics, phase_schedule: Drive, duration: Float[Array, ""], motion: Motion
+    dynamics: PathDynamics, phase_schedule: Actuation, duration: Float[Array, ""], motion: Motion
 ) -> DenseOutput:
     """Interpolate the steps of a motion."""
     # A step that takes no time has no speed of its own: its neighbours hold the speeds before and after it.
@@ -63,7 +63,7 @@ def _cubics(dynamics, loop: PhaseLoop, duration, steps: DenseOutput, s, memory) 
 
 
 def quintic_hermite(
-    dynamics: PathDynamics, phase_schedule: Drive, duration, phase_time, s, w, segment, row, is_moving, memory=None
+    dynamics: PathDynamics, phase_schedule: Actuation, duration, phase_time, s, w, segment, row, is_moving, memory=None
 ) -> Float[Array, "6"]:
     """Compute the coefficients of the quintic Hermite polynomial of a step in `xi` in [0, 1].
 

@@ -6,9 +6,8 @@ and tolerances mean the same for every size and duration:
     ds/du = w,    dw/du = T^2 (A0 + A3 tau1 + A4 tau2) + T A2 w + A1 w^2
 
 with the coefficients `PathDynamics.acceleration`. In closed loop the memory of the law joins the state
-(`closed_loop`).
- Within a segment of the path and an interval of the torque schedule
-the right-hand side is smooth. Derivation: section 6 of `docs/derivation.md`.
+(`closed_loop`). Within a segment of the path and an interval of the torque schedule the right-hand side is
+smooth. Derivation: section 6 of `docs/derivation.md`.
 """
 
 from typing import NamedTuple
@@ -19,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from wholearm_jax.dynamics import PathDynamics, evaluate_dot, locate_panel
-from wholearm_jax.simulation.closed_loop import Drive, PhaseLoop, memory_rate, torque_of
+from wholearm_jax.simulation.closed_loop import Actuation, PhaseLoop, memory_rate, torque_of
 from wholearm_jax.simulation.integrator_options import IntegratorOptions, differentiable_solver
 
 
@@ -27,13 +26,13 @@ class PathODE(NamedTuple):
     """What the equation depends on."""
 
     dynamics: PathDynamics
-    phase_schedule: Drive
+    phase_schedule: Actuation
     duration: Float[Array, ""]  # of the phase, or of the part of it that is one unit of phase time [s]
 
 
 @jax.jit
 def path_acceleration(
-    dynamics: PathDynamics, phase_schedule: Drive, duration, segment, row, phase_time, s, w, memory=None
+    dynamics: PathDynamics, phase_schedule: Actuation, duration, segment, row, phase_time, s, w, memory=None
 ) -> Float[Array, ""]:
     """Evaluate `dw/du` for forward travel, in a segment and an interval `row` of the schedule.
 
@@ -47,10 +46,10 @@ def path_acceleration(
 
 def state_rate(ode: PathODE, segment, row, phase_time, y) -> Float[Array, "state"]:
     """Evaluate `dy/du` at the state `y = (s, w)` or, in closed loop, `(s, w, *memory)`."""
-    if isinstance(ode.phase_schedule, PhaseLoop):
-        dynamics, loop, duration = ode
+    dynamics, actuation, duration = ode
+    if isinstance(actuation, PhaseLoop):
         acceleration = path_acceleration(*ode, segment, row, phase_time, y[0], y[1], y[2:])
-        remembered = memory_rate(loop, dynamics, duration, segment, row, phase_time, y[0], y[2:])
+        remembered = memory_rate(actuation, dynamics, duration, segment, row, phase_time, y[0], y[2:])
         return jnp.concatenate([jnp.stack([y[1], acceleration]), remembered])
     return jnp.stack([y[1], path_acceleration(*ode, segment, row, phase_time, y[0], y[1])])
 

@@ -10,7 +10,7 @@ from wholearm_jax.model import LawTables, PhaseTables
 from wholearm_jax.simulation.closed_loop import PhaseLoop, interpolate_rows
 from wholearm_jax.tracing import chebyshev_points
 
-PROJECTIONS = 4  # Newton steps of the projection on the law's curve
+PLACE_ITERATIONS = 4  # Newton steps of the projection on the law's curve
 
 
 def loop_duration(law: LawTables, phase: PhaseTables) -> Float[Array, ""]:
@@ -101,12 +101,12 @@ def _place_along_path(phase: PhaseTables, dynamics: PathDynamics) -> Float[Array
     steps = jnp.hypot(*jnp.diff(stop_gradient(flat), axis=0).T)
     guess = jnp.concatenate([jnp.zeros(1, flat.dtype), jnp.cumsum(steps)])
 
-    def project(angles, s):
-        for _ in range(PROJECTIONS):
+    def place_of(angles, s):
+        for _ in range(PLACE_ITERATIONS):
             inside = jnp.clip(s, 0.0, phase.length)
             tangent = interpolate_rows(phase.s, phase.tangent, inside)
             s = s + tangent @ (angles - interpolate_rows(phase.s, phase.theta, inside) - (s - inside) * tangent)
         return s
 
-    places = jax.vmap(project)(flat, guess).reshape(angles.shape[:2])
+    places = jax.vmap(place_of)(flat, guess).reshape(angles.shape[:2])
     return fit_panels({"place": places})[0]["place"]

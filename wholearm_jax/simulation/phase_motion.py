@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import Status, take_row
 from wholearm_jax.dynamics import PathDynamics
-from wholearm_jax.model import interval
-from wholearm_jax.simulation.closed_loop import Drive, PhaseLoop
+from wholearm_jax.model import PhaseSchedule, interval
+from wholearm_jax.simulation.closed_loop import Actuation, PhaseLoop
 from wholearm_jax.simulation.closed_loop_rest import rest_until_departure
 from wholearm_jax.simulation.departure import first_departure
 from wholearm_jax.simulation.event_step import step_to_event
@@ -49,7 +49,7 @@ class _MotionState(NamedTuple):
 
 def simulate_motion(
     dynamics: PathDynamics,
-    phase_schedule: Drive,
+    phase_schedule: Actuation,
     duration: Float[Array, ""],
     *,
     options: IntegratorOptions,
@@ -147,8 +147,13 @@ def _simulate_stage(ode: PathODE, options: IntegratorOptions, ignore_stops, stat
         status=jnp.select(conditions, statuses, int(Status.OK)),
         done=blocked | ~complete | event.failed | at_path_end | ~overshot,
         record=record,
-        memory=None if event.memory is None else jnp.where(overshot, event.memory, state.memory),
+        memory=_choose(overshot, event.memory, state.memory),
     )
+
+
+def _choose(is_first, first, second):
+    """Choose one of two memories of a law; None in open loop."""
+    return None if first is None else jnp.where(is_first, first, second)
 
 
 def _dwell(ode: PathODE, options, ignore_stops, state: _MotionState):
@@ -157,6 +162,7 @@ def _dwell(ode: PathODE, options, ignore_stops, state: _MotionState):
     Returns the state after it, the status of the departure, and the number of steps that the record has room for.
     """
     dynamics, phase_schedule, _ = ode
+    assert isinstance(phase_schedule, PhaseSchedule)
     is_resting = (state.w <= 0) & ~ignore_stops
     phase_time, rest_status = first_departure(dynamics, phase_schedule, state.segment, state.s, state.phase_time)
     phase_time = jnp.where(is_resting, phase_time, state.phase_time)
@@ -173,12 +179,12 @@ def _dwell_in_closed_loop(ode: PathODE, options, ignore_stops, state: _MotionSta
     """Wait as `_dwell` does, while the law goes on."""
     is_resting = (state.w <= 0) & ~ignore_stops
     rest = rest_until_departure(ode, options, state.segment, state.s, state.phase_time, state.memory, is_resting)
-    room = options.max_steps - state.record.count
-    record = append_rest(state.record, rest.steps, state.s, state.segment, jnp.minimum(rest.whole, room))
+    capacity = options.max_steps - state.record.count
+    record = append_rest(state.record, rest.steps, state.s, state.segment, jnp.minimum(rest.whole, capacity))
     node, crosses = (rest.phase_time, state.s, state.w, rest.memory), rest.steps.count > rest.whole
     record = append_step(record, crosses, node, state.w, state.segment, rest.row, at_rest=True)
     state = state._replace(phase_time=rest.phase_time, memory=rest.memory, record=record)
-    return state, jnp.where(is_resting, rest.status, int(Status.OK)), room - rest.steps.count
+    return state, jnp.where(is_resting, rest.status, int(Status.OK)), capacity - rest.steps.count
 
 
 def _record_steps(
@@ -220,7 +226,7 @@ def _integrate(ode: PathODE, options: IntegratorOptions, state: _MotionState, fi
     return solve(replay_steps, *inputs, steps)
 
 
-def _field(parameters, phase_schedule: Drive):
+def _field(parameters, phase_schedule: Actuation):
     """Return the field of a segment for the integrator."""
     dynamics, duration, segment = parameters
     ode = PathODE(dynamics, phase_schedule, duration)

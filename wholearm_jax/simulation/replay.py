@@ -11,13 +11,13 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from wholearm_jax.core import take_row
-from wholearm_jax.simulation.closed_loop import Drive
+from wholearm_jax.simulation.closed_loop import Actuation
 from wholearm_jax.simulation.integrator import AcceptedSteps, integrate_adaptive
 from wholearm_jax.simulation.integrator_options import IntegratorOptions, differentiable_solver
 
 
 def replay_steps(
-    field: Callable, phase_schedule: Drive, options: IntegratorOptions, begin, final, y, steps: AcceptedSteps
+    field: Callable, phase_schedule: Actuation, options: IntegratorOptions, begin, final, y, steps: AcceptedSteps
 ) -> AcceptedSteps:
     """Take the steps of `integrate_adaptive` again, differentiably; those that end on a knot move with it."""
     count, row = steps.count, steps.row
@@ -50,7 +50,7 @@ def replay_steps(
     return steps._replace(end=ends, y=ys)
 
 
-def _step_ends(phase_schedule: Drive, steps: AcceptedSteps, final) -> Float[Array, "steps"]:
+def _step_ends(phase_schedule: Actuation, steps: AcceptedSteps, final) -> Float[Array, "steps"]:
     """Return where steps end: on a knot, which may move, or at a fixed time."""
     knot = phase_schedule.phase_time[steps.row + 1]
     return jnp.where((steps.end == stop_gradient(knot)) & (steps.end < final), knot, stop_gradient(steps.end))
