@@ -1,4 +1,4 @@
-"""`wholearm check`: one schedule against very many scenes, in a store that the same command can resume.
+"""`wholearm check`: one schedule or controller against very many scenes, in a store that the same command can resume.
 
 Every process of a run (`--coordinator`, or SLURM's variables) computes each `--processes`-th chunk; the first process
 makes the store, and summarises it at the end. Each process has one device for every processor that it may run on.
@@ -36,7 +36,8 @@ Vary = Annotated[list[str] | None, typer.Option("--vary", help="QUANTITY=AMOUNT,
 def check(
     scene: SceneName,
     out: Annotated[Path, typer.Option(help="The Zarr store of results; a summary and figures stand beside it.")],
-    torque: Annotated[Path | None, typer.Option(help=f"{TORQUE_HELP} Needed unless --optimise is given.")] = None,
+    torque: Annotated[Path | None, typer.Option(help=f"{TORQUE_HELP} Or --controller, or --optimise.")] = None,
+    controller: Annotated[Path | None, typer.Option(help="A controller.json: check in closed loop.")] = None,
     vary: Vary = None,
     polygons: Annotated[Path | None, typer.Option(help="Objects to put in the scene, .npz.")] = None,
     count: Annotated[int | None, typer.Option(min=1, help="How many scenes to draw.")] = None,
@@ -58,11 +59,11 @@ def check(
     process: Annotated[int | None, typer.Option(min=0, help="Which of them this is, from 0.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check a schedule against many variants of a scene; the same command goes on with a store it left unfinished."""
+    """Check a schedule, or a controller, in many variants of a scene; the same command goes on where it was stopped."""
     if (polygons is None) == (count is None) or (polygons is None) != bool(vary):
         raise BadInput("check: give either --count, with --vary QUANTITY=AMOUNT, or --polygons FILE.npz")
-    if torque is None and not optimise:
-        raise BadInput("check: give --torque FILE, or --optimise")
+    if (torque is None) == (controller is None) and not (optimise and torque is None):
+        raise BadInput("check: give one of --torque FILE, --controller FILE and --optimise")
     if out.suffix in SUMMARY_SUFFIXES:
         raise BadInput(f"--out {out}: {out.suffix} is what stands beside the store; name the store otherwise, as .zarr")
     from wholearm_jax.files import count_polygons, read_polygons
@@ -72,14 +73,15 @@ def check(
     use_all_processors()
     rank = join_processes(coordinator, processes, process)
     loaded = _load_moving(scene)
-    schedule = None if optimise or torque is None else _read_schedule(loaded, torque, rank)
-    if optimise and torque is not None and rank.is_first:
-        note(f"with --optimise each scene gets a schedule of its own: {torque} is not followed")
+    actuation = None if optimise else _read_actuation(loaded, torque, controller, rank)
+    if optimise and (torque or controller) and rank.is_first:
+        note(f"with --optimise each scene gets a schedule of its own: {torque or controller} is not followed")
     source = read_polygons(polygons, loaded) if polygons else parse_ensemble(loaded, vary, seed)
     total = count if count is not None else int(source.scenes.object.mass.shape[0])  # pyright: ignore
     limits = {"arrival": None, "tolerance": None} if optimise else {"arrival": arrival, "tolerance": tolerance}
     settings = limits | {"optimise": knots if optimise else None, "seed": seed}
-    _run(_Job(source, schedule, settings, total, min(chunk, total), optimise, knots), loaded, out, rank, as_json)
+    job = _Job(source, actuation, settings, total, min(chunk, total), optimise, knots, None if optimise else controller)
+    _run(job, loaded, out, rank, as_json)
     sys.exit(0)
 
 
@@ -100,6 +102,22 @@ def _load_moving(name: str):
     return scene
 
 
+def _read_actuation(scene, torque: Path | None, controller: Path | None, rank: ProcessRank):
+    """Read the schedule, or the law, that all scenes follow."""
+    if torque is not None:
+        return _read_schedule(scene, torque, rank)
+    assert controller is not None
+    from wholearm_jax.feedback import law_tables, require_same_plan
+    from wholearm_jax.files import read_controller
+
+    law = read_controller(controller)
+    try:
+        require_same_plan(law, scene)
+    except ValueError as error:
+        raise BadInput(f"{controller}: {error}") from None
+    return law_tables(law)
+
+
 def _read_schedule(scene, torque: Path, rank: ProcessRank):
     """Read the schedule that all scenes follow."""
     from wholearm_jax.files import read_torque
@@ -116,12 +134,13 @@ class _Job:
     """The scenes to compute, and how."""
 
     source: Any  # of scenes: an ensemble or a batch
-    torque: Any  # the schedule that all follow; None with `optimise`
+    actuation: Any  # the schedule, or the law, that all follow; None with `optimise`
     settings: dict[str, Any]
     count: int  # of scenes
     chunk: int  # scenes a chunk
     optimise: bool
     knots: int  # a phase, with `optimise`
+    controller: Path | None  # file of the law, if there is one
 
     @property
     def schedule_rows(self) -> int:
@@ -134,13 +153,14 @@ def _run(job: _Job, scene, out: Path, rank: ProcessRank, as_json: bool) -> None:
     from wholearm_jax.cli.tables import print_json
     from wholearm_jax.files.check_store import fingerprint, store_metadata
 
-    digests = {"scenes": fingerprint(job.source), "torque": fingerprint(job.torque)}
+    kind = "torque" if job.controller is None else "controller"
+    digests = {"scenes": fingerprint(job.source), kind: fingerprint(job.actuation)}
     metadata = store_metadata(job.count, job.chunk, **job.settings, **digests)
     store = _open_shared_store(out, metadata, job, rank)
     _fill(store, job, rank)
     rank.wait_for_others("filled")
     if rank.is_first:
-        lines, content = _summarise(store, scene, job.source, out)
+        lines, content = _summarise(store, scene, job.source, out, job.controller)
         if as_json:
             print_json(content)
         else:
@@ -179,7 +199,7 @@ def _check_chunks(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]]:
     from wholearm_jax.ensembles import check_in_chunks
 
     settings = {"tolerance": job.settings["tolerance"], "arrival": job.settings["arrival"]}
-    parts = check_in_chunks(job.source, job.torque, job.count, chunk=job.chunk, chunk_numbers=missing, **settings)
+    parts = check_in_chunks(job.source, job.actuation, job.count, chunk=job.chunk, chunk_numbers=missing, **settings)
     for number, part in parts:
         yield number, part._asdict()
 
@@ -207,8 +227,11 @@ def _optimise_chunks(job: _Job, missing: list[int]) -> Iterator[tuple[int, dict]
             yield number, {**BatchResult(*columns)._asdict(), "torque": np.stack(schedules)}
 
 
-def _summarise(store, scene, source, out: Path):
-    """Summarise the store, and write `NAME.json` and figures next to it; return the lines to print, and the content."""
+def _summarise(store, scene, source, out: Path, controller: Path | None):
+    """Summarise the store, and write `NAME.json` and figures next to it; return the lines to print, and the content.
+
+    The content names the `controller`, if there is one.
+    """
     import json
 
     import jax
@@ -221,6 +244,7 @@ def _summarise(store, scene, source, out: Path):
 
     summary = summarise(scene, (store.read(k) for k in range(store.chunks)), store.count)
     mapped, more = (), {}
+    law = {} if controller is None else {"controller": str(controller)}
     if isinstance(source, Ensemble) and source.parameters:
         offsets = np.asarray(jax.lax.map(source.draw_offsets, summary.numbers, batch_size=1024))
         influence = rank_correlations(summary.margins, offsets)
@@ -229,7 +253,7 @@ def _summarise(store, scene, source, out: Path):
         more = {"influence": {name: rank for name, rank in pairs if rank}}
     files = FileSet(f"{out.stem}.json", (), (out.stem,))
     with refuse_unwritable(str(out)), replace_files(out.parent, files) as scratch:
-        content = null_for_undefined(summary.as_dict() | more)
+        content = null_for_undefined(law | summary.as_dict() | more)
         write_atomically(scratch / f"{out.stem}.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
         save_figure(lambda: plot_ensemble(summary, more.get("influence"), mapped), scratch, out.stem)
     return summary.lines, content

@@ -182,8 +182,10 @@ def choose_actuation(
     if isinstance(controller, LawTables):
         return controller
     assert controller is not None
-    if isinstance(source, Ensemble):
-        require_same_plan(controller, source.nominal)
+    require_same_plan(controller, source.draw(0) if isinstance(source, SceneBatch) else source.nominal)
+    formations = [phase.formation for phase in source.nominal.phases] if isinstance(source, SceneBatch) else []
+    if any((leaf != leaf[:1]).any() for leaf in map(np.asarray, jax.tree.leaves(formations))):
+        raise ValueError("the controller is for one plan, but the scenes differ in their contact formations")
     return law_tables(controller)
 
 
