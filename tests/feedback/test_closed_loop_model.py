@@ -13,11 +13,14 @@ import wholearm_jax as wa
 from tests.reference import unreduced
 from tests.reference.closed_loop import ClosedLoop
 from wholearm_jax.dynamics import tabulate_path_dynamics
+from wholearm_jax.ensembles.ensemble import make_ensemble
+from wholearm_jax.ensembles.scene_check import from_result
 from wholearm_jax.feedback import law_tables
 from wholearm_jax.files import controller_to_dict, scene_toml
 from wholearm_jax.model import rigid_body, scaled_mechanics
 from wholearm_jax.phases import (
     closed_loop_options,
+    closed_loop_result,
     configuration,
     initial_loop_carry,
     loop_step,
@@ -121,6 +124,16 @@ def test_derivatives_are_those_of_differences(first_phase):
     for k in range(3):
         difference = steadiest_difference(lambda h, k=k: float(plain(here.at[k].add(h)).margin_result.margin))
         assert float(forward[0, k]) == pytest.approx(difference, rel=1e-7)
+
+
+def test_a_batch_is_what_each_scene_is_alone(thin, scene):
+    ensemble = make_ensemble(scene, {"friction": "20%", "mass": "5%"}, seed=1)
+    checked = wa.check(ensemble, controller=thin, count=2)
+    alone = from_result(closed_loop_result(ensemble.draw(1), law_tables(thin)))
+    assert wa.Status(int(checked.status[1])) is wa.Status.OK
+    assert checked.status[1] == alone.status
+    assert checked.margin[1] == pytest.approx(float(alone.margin), abs=1e-6)
+    np.testing.assert_allclose(checked.end[1], alone.end, atol=1e-6)
 
 
 def test_a_check_needs_a_schedule_or_a_controller_for_its_plan(thin, scene):

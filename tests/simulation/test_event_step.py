@@ -29,7 +29,7 @@ def program():
     def step(acceleration, s, w, s_stop, w_stop, is_needed):
         dynamics = eqx.tree_at(lambda d: d.acceleration, empty, empty.acceleration.at[:, 0, 0].set(acceleration))
         ode, zero = PathODE(dynamics, schedule, jnp.asarray(DURATION)), jnp.asarray(0)
-        start = jnp.asarray(BEGIN), s, w
+        start = jnp.asarray(BEGIN), s, w, None
         return step_to_event(ode, IntegratorOptions(), zero, zero, start, END, s_stop, w_stop, is_needed)
 
     return jax.jit(step), jax.jit(jax.jacfwd(lambda *args: step(*args, jnp.asarray(True))[:3], (0, 1, 2, 3)))
