@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from wholearm_jax.core import Status, fused_matmul, inverse_and_determinant, null_vector
 from wholearm_jax.dynamics.motion_equations import equations_of_motion
@@ -35,6 +35,11 @@ def tabulate_path_dynamics(mechanics: ScaledMechanics, path: ContactPath) -> Pat
     conditioned.
     """
     solution, impact_map = _solve_nodes(mechanics, path)
+    is_away = mechanics.contacts.is_away
+    if is_away is not None:  # what holds a finger that is away is no contact's force: it counts as the first again
+        solution = solution._replace(force=_repeat_first(solution.force, is_away, axis=-2))
+        impulses = _repeat_first(impact_map[1:], is_away, axis=0)
+        impact_map = jnp.concatenate([impact_map[:1], impulses])
     # Convert to SI units.
     torque, force = mechanics.torque_unit, mechanics.force_unit
     per_term = jnp.stack([jnp.ones_like(torque), jnp.ones_like(torque), jnp.ones_like(torque), 1 / torque, 1 / torque])
@@ -70,6 +75,11 @@ def tabulate_path_dynamics(mechanics: ScaledMechanics, path: ContactPath) -> Pat
         condition=condition,
         status=jnp.where(path.status > 0, path.status, jnp.where(is_singular, int(Status.SINGULAR), 0)),
     )
+
+
+def _repeat_first(values, where: Bool[Array, "rows"], axis: int):
+    """Replace rows by the first one."""
+    return jnp.where(jnp.expand_dims(where, -1), jnp.take(values, jnp.array([0]), axis=axis), values)
 
 
 def _solve_nodes(mechanics: ScaledMechanics, path: ContactPath) -> tuple[_NodeSolution, Float[Array, "5 5"]]:

@@ -10,7 +10,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import Status, stack_trees
 from wholearm_jax.dynamics import PathDynamics, tabulate_path_dynamics
-from wholearm_jax.model import ContactFormation, LawTables, Scene, TorqueSchedule, rigid_body, scaled_mechanics
+from wholearm_jax.model import (
+    ContactFormation,
+    LawTables,
+    Scene,
+    TorqueSchedule,
+    alike_formations,
+    rigid_body,
+    scaled_mechanics,
+)
 from wholearm_jax.phases import (
     Result,
     SimulatedPhase,
@@ -106,7 +114,8 @@ def check_on_paths(
         certified = certify_rest(mechanics, dynamics, schedule, simulated)
         return carry, _summarise_phase(dynamics, simulated, formation, fidelity, certified)
 
-    phases = stack_trees([(phase_inputs(p), p.formation) for p in scene.phases])
+    formations = alike_formations([p.formation for p in scene.phases])
+    phases = stack_trees([(phase_inputs(p), one) for p, one in zip(scene.phases, formations, strict=True)])
     _, checks = jax.lax.scan(check_phase, initial_carry(schedule), (paths, *phases))
     return _combine_phases(checks, len(scene.phases))
 

@@ -16,11 +16,12 @@ from pydantic import (
     StrictBool,
     Tag,
     ValidationError,
+    ValidationInfo,
     model_validator,
 )
 
 from wholearm_jax.files.angles import Angle, read_angles_by_coordinate
-from wholearm_jax.model import COORDINATES, find_defect, parse_contact
+from wholearm_jax.model import AWAY, COORDINATES, find_defect, hold_contacts, parse_contact, regrasp_finger
 
 CONSTRAINTS = 4
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -124,16 +125,31 @@ class GoalTable(_Strict):
     on: Annotated[str, Field(pattern=r"^e[0-9]+$")] | None = None
 
 
-def _four_constraints(contacts: list[str]) -> list[str]:
+def _constraints(contacts: list[str], checked: ValidationInfo) -> list[str]:
+    """Refuse contacts that make no path; those of a regrasp are completed first."""
     rows = [parse_contact(text) for text in contacts]
     if len(set(row[:3] for row in rows)) < len(rows):
         raise ValueError("the same contact stands twice")
+    away = [row[0] for row in rows if row[1] == AWAY]
+    if len(away) > 1 or any(row[0] in away for row in rows if row[1] != AWAY):
+        raise ValueError("a finger that is away has no contact, and the other one is not away")
+    if checked.data.get("regrasp") is not None:
+        return [*hold_contacts(contacts, checked.data["regrasp"])]
     rolling = sum(row[3] for row in rows)
     count = len(rows) + rolling
     if count != CONSTRAINTS:
         split = f" ({rolling} rolling, two each; {len(rows) - rolling} sliding, one each)" if rolling else ""
         raise ValueError(f"{count} constraints{split}; a path needs exactly {CONSTRAINTS}")
     return contacts
+
+
+def _away(contacts: list[str]) -> list[str]:
+    return [text for text in contacts if parse_contact(text)[1] == AWAY]
+
+
+def _regrasp(text: str) -> str:
+    regrasp_finger(text)
+    return text
 
 
 def _signed_coordinate(toward: str) -> str:
@@ -155,7 +171,8 @@ _Until = Annotated[
 
 class PhaseTable(_Strict):
     name: str
-    contacts: Annotated[list[str], AfterValidator(_four_constraints)]
+    regrasp: Annotated[str, AfterValidator(_regrasp)] | None = None
+    contacts: Annotated[list[str], AfterValidator(_constraints)]
     toward: Annotated[str, AfterValidator(_signed_coordinate)] | None = None
     duration: Positive
     until: _Until | None = None
@@ -164,13 +181,33 @@ class PhaseTable(_Strict):
 
     def complaint(self, before: "PhaseTable | None") -> str | None:
         """The key that does not fit the others, and why; `before` is the phase before this one."""
+        if before is not None and before.arrive in ("moving", "caught"):
+            started = sorted({*_away(self.contacts)} - {*_away(before.contacts)})
+            if started:
+                return f"contacts: {started[0]} must be at rest; phase '{before.name}' arrives {before.arrive}"
+        if self.regrasp is not None:
+            return self._regrasp_complaint(self.regrasp)
         if not self.hold:
-            return "toward: missing"
+            return "toward: missing" if self.toward is None else None
         given = next((key for key in ("toward", "until", "arrive") if getattr(self, key) is not None), None)
         if given is not None:
             return f"{given}: a phase with hold = true does not move; leave it out"
         if before is not None and before.arrive == "moving":
             return f"hold: phase '{before.name}' arrives moving; only an object at rest can be held"
+        return None
+
+    def _regrasp_complaint(self, regrasp: str) -> str | None:
+        """The same, of a phase in which a finger moves alone."""
+        joint = f"theta{regrasp_finger(regrasp)}"
+        if self.hold:
+            return "hold: a finger moves in a regrasp; leave it out"
+        if self.toward is not None and self.toward[:-1] != joint:
+            return f"toward: {regrasp} moves {joint} alone; leave it out"
+        leaves = parse_contact(regrasp)[1] == AWAY
+        if leaves and (self.until is None or joint not in self.until):
+            return f"until: missing; say how far the finger opens: until = {{ {joint} = ... }}"
+        if not leaves and self.until is not None:
+            return f"until: the finger moves until it makes {regrasp}; leave it out"
         return None
 
 
@@ -190,13 +227,13 @@ class SceneTables(_Strict):
         for k, phase in enumerate(self.phase):
             if phase.name in names[:k]:
                 raise ValueError(f"phase[{k}].name: '{phase.name}' stands twice; give each phase its own name")
-            if phase.hold or phase.toward is None:
-                wrong = phase.complaint(self.phase[k - 1] if k else None)
-                if wrong is not None:
-                    raise ValueError(f"phase[{k}].{wrong}")
-            for text in phase.contacts:
+            wrong = phase.complaint(self.phase[k - 1] if k else None)
+            if wrong is not None:
+                raise ValueError(f"phase[{k}].{wrong}")
+            keys = [("contacts", text) for text in phase.contacts]
+            for key, text in [*keys, *([("regrasp", phase.regrasp)] if phase.regrasp else [])]:
                 if parse_contact(text)[2] >= count:
-                    raise ValueError(f"phase[{k}].contacts: '{text}': the object has vertices 0 to {count - 1}")
+                    raise ValueError(f"phase[{k}].{key}: '{text}': the object has vertices 0 to {count - 1}")
         return self
 
 

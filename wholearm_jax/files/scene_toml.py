@@ -28,6 +28,7 @@ from wholearm_jax.model import (
     contact_formation,
     path_target,
     polygon,
+    regrasp_toward,
     resting_angle,
     resting_configuration,
 )
@@ -178,9 +179,10 @@ def _build(checked: SceneTables) -> Scene:
             Phase(
                 p.name,
                 contact_formation(p.contacts),
-                path_target(p.toward, p.until),
+                path_target(regrasp_toward(p.regrasp) if p.regrasp and not p.toward else p.toward, p.until),
                 as_device_array(p.duration, float),
                 Arrival.HOLD if p.hold else ARRIVALS[p.arrive or "rest"],
+                p.regrasp,
             )
             for p in checked.phase
         ),
@@ -217,7 +219,8 @@ def to_dict(scene: Scene) -> dict[str, Any]:
 
 def _phase_dict(phase: Phase) -> dict[str, Any]:
     target = phase.target
-    row: dict[str, Any] = {"name": phase.name, "contacts": list(phase.formation.names)}
+    row: dict[str, Any] = {"name": phase.name, "contacts": [*phase.formation.names, *phase.formation.away]}
+    row |= {"regrasp": phase.regrasp} if phase.regrasp else {}
     if phase.arrive is Arrival.HOLD:
         return row | {"hold": True, "duration": float(phase.duration)}
     if int(target.coordinate) < 0:

@@ -207,5 +207,8 @@ def _viscous_torque(acceleration, force):
     p00, p01, p11 = ((pull[..., i] * pull[..., j]).sum(1) for i, j in ((0, 0), (0, 1), (1, 1)))
     q0, q1 = ((pull[..., i] * drag).sum(1) for i in (0, 1))
     det = p00 * p11 - p01**2
-    det = jnp.where(det > 0, det, 1.0)
-    return jnp.stack([p11 * q0 - p01 * q1, p00 * q1 - p01 * q0], axis=1) / det[:, None]
+    both = jnp.stack([p11 * q0 - p01 * q1, p00 * q1 - p01 * q0], axis=1) / jnp.where(det > 0, det, 1.0)[:, None]
+    # The torque of a finger that is away has no effect: then the other one's is determined alone.
+    sizes = jnp.stack([p00, p11], axis=1)
+    alone = jnp.where(sizes > 0, jnp.stack([q0, q1], axis=1) / jnp.where(sizes > 0, sizes, 1.0), 0.0)
+    return jnp.where((det > 0)[:, None], both, alone)

@@ -32,6 +32,7 @@ FINGER_ROOT, PALM_END = (
 CORNER_TOL = (
     1e-6  # length units of an edge beside its ends at which it is a vertex of the object that meets such a corner
 )
+UNBOUNDED = 1e6  # length units beyond which nothing is: limits of what has none
 FEATURE_GROUPS = (
     *((0, VERTEX), (1, VERTEX), (2, VERTEX), (1, EDGE), (2, EDGE)),
     *((1, FINGER_ROOT), (2, FINGER_ROOT), (1, PALM_END), (2, PALM_END)),
@@ -76,6 +77,7 @@ class ContactSet(eqx.Module):
     slides: Bool[Array, "rows"]
     rolling_anchor: Float[Array, "rows"]
     carrier: Carrier | None = None  # None: the object in every row
+    is_away: Bool[Array, "rows"] | None = None  # whether a row holds a finger's angle at its anchor; None: no row does
 
 
 class ContactKinematics(eqx.Module):
@@ -108,7 +110,7 @@ def contact_set(body: RigidBody, hand: Hand, formation: ContactFormation) -> Con
     def components(vectors) -> Vector:
         return vectors[:, 0], vectors[:, 1]
 
-    return ContactSet(
+    contacts = ContactSet(
         on_link=on_link,
         finger=components(finger),
         side=jnp.where(formation.link == 2, -1.0, 1.0).astype(body.mass.dtype),
@@ -124,11 +126,34 @@ def contact_set(body: RigidBody, hand: Hand, formation: ContactFormation) -> Con
         slides=~formation.tangential & ~jnp.roll(formation.tangential, -1),
         rolling_anchor=jnp.zeros_like(length),
     )
+    return contacts if formation.is_away is None else _with_away_rows(contacts, formation.is_away)
+
+
+def _with_away_rows(contacts: ContactSet, is_away: Bool[Array, "rows"]) -> ContactSet:
+    """Turn rows into those of fingers that are away: no feature to leave, no friction, no slip."""
+    return eqx.tree_at(
+        lambda c: (c.lower, c.upper, c.friction, c.slides, c.is_away),
+        contacts,
+        (
+            jnp.where(is_away, -UNBOUNDED, contacts.lower),
+            jnp.where(is_away, UNBOUNDED, contacts.upper),
+            jnp.where(is_away, 0.0, contacts.friction),
+            contacts.slides & ~is_away,
+            is_away,
+        ),
+        is_leaf=lambda leaf: leaf is None,
+    )
 
 
 def anchor_rolling(contacts: ContactSet, z: Float[Array, "5"]) -> ContactSet:
-    """Contacts that roll stay from now on at the places `along` their features which they have at `z`."""
-    return eqx.tree_at(lambda c: c.rolling_anchor, contacts, contact_kinematics(contacts, z).along)
+    """Contacts that roll stay from now on at the places `along` their features which they have at `z`.
+
+    Fingers that are away stay at their angles.
+    """
+    anchor = contact_kinematics(contacts, z).along
+    if contacts.is_away is not None:
+        anchor = jnp.where(contacts.is_away, _link_rate(contacts, z), anchor)
+    return eqx.tree_at(lambda c: c.rolling_anchor, contacts, anchor)
 
 
 def contact_candidates(capacity: int) -> ContactFormation:
@@ -246,20 +271,28 @@ def slip_velocity_at(contacts: ContactSet, at: ContactKinematics, x: Float[Array
 def constraints(contacts: ContactSet, z: Float[Array, "5"]) -> Float[Array, "rows"]:
     """What a formation keeps at zero: gaps `C_n(z)`, and `C_t(z)` in the tangential rows of rolling contacts."""
     at = contact_kinematics(contacts, z)
-    return jnp.where(contacts.tangential, _feature_sign(contacts) * (at.along - contacts.rolling_anchor), at.gap)
+    values = jnp.where(contacts.tangential, _feature_sign(contacts) * (at.along - contacts.rolling_anchor), at.gap)
+    if contacts.is_away is None:
+        return values
+    return jnp.where(contacts.is_away, _link_rate(contacts, z) - contacts.rolling_anchor, values)
 
 
 @jax.jit
 def constraint_jacobian(contacts: ContactSet, z: Float[Array, "5"]) -> Float[Array, "rows 5"]:
     """The gradient `G` of `constraints`: `G_n`, and `G_t` in the tangential rows."""
     at = contact_kinematics(contacts, z)
-    return _jacobian_along(contacts, at, _constraint_direction(contacts, at))
+    rows = _jacobian_along(contacts, at, _constraint_direction(contacts, at))
+    if contacts.is_away is None:
+        return rows
+    none, (first, second) = jnp.zeros_like(contacts.lower), contacts.finger
+    return jnp.where(contacts.is_away[:, None], jnp.stack([none, none, none, first, second], axis=1), rows)
 
 
 def constraint_velocity(contacts: ContactSet, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "rows"]:
     """`G x`, without the rows: a few sums a contact, where only they are wanted."""
     at = contact_kinematics(contacts, z)
-    return _velocity_along(contacts, at, _constraint_direction(contacts, at), x)
+    rates = _velocity_along(contacts, at, _constraint_direction(contacts, at), x)
+    return rates if contacts.is_away is None else jnp.where(contacts.is_away, _link_rate(contacts, x), rates)
 
 
 def constraint_second_derivative(
@@ -285,7 +318,8 @@ def constraint_second_derivative(
     ay = -sign * turn**2 * by - swept**2 * jy
     w = jnp.where(on, swing, turn)
     ux, uy = jnp.where(contacts.tangential, ny, nx), jnp.where(contacts.tangential, -nx, ny)
-    return sign * (ux * ax + uy * ay - w**2 * (ux * rx + uy * ry) + 2 * w * (ux * vy - uy * vx))
+    bend = sign * (ux * ax + uy * ay - w**2 * (ux * rx + uy * ry) + 2 * w * (ux * vy - uy * vx))
+    return bend if contacts.is_away is None else jnp.where(contacts.is_away, 0.0, bend)
 
 
 def _feature_sign(contacts: ContactSet) -> Float[Array, "rows"]:
@@ -317,7 +351,7 @@ def _velocity_along(contacts: ContactSet, at: ContactKinematics, direction: Vect
 
 
 def _link_rate(contacts: ContactSet, x: Float[Array, "5"]) -> Float[Array, "rows"]:
-    """How fast each contact's own link turns; the palm does not."""
+    """How fast each contact's own link turns; the palm does not. Of a configuration: the link's angle."""
     first, second = contacts.finger
     return first * x[3] + second * x[4]
 

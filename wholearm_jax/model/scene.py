@@ -7,7 +7,7 @@ given vertices.
 
 import enum
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,7 +23,9 @@ ANGLE_COORDINATES = ("phi", "theta1", "theta2")
 LINKS = ("palm", "finger1", "finger2")
 FLUSH_TOLERANCE = 1e-6  # [m]
 VERTEX, EDGE = 0, 1  # contact types: A, an object vertex on a link; B, a fingertip on an object edge
+AWAY = 4  # no contact: a finger that touches nothing and stands still (2 and 3 are corners of links, `kinematics`)
 _CONTACT_PATTERN = re.compile(r"(palm|finger1|finger2):([ve])([0-9]+)( rolling)?")
+_AWAY_PATTERN = re.compile(r"(finger1|finger2):away")
 
 
 class MassProperties(NamedTuple):
@@ -76,13 +78,15 @@ class ContactFormation(eqx.Module):
     `EDGE`) and feature number.
 
     A sliding contact has one row, its gap. A rolling contact has two, one behind the other: its gap, then its slip,
-    marked `tangential`. Four rows make a path: `2R + S = 4`.
+    marked `tangential`. A finger that is away has one row, behind all others: its joint angle. Four rows make a path:
+    `2R + S = 4`.
     """
 
     link: Int[Array, "rows"]
     kind: Int[Array, "rows"]
     feature: Int[Array, "rows"]
     tangential: Bool[Array, "rows"]
+    is_away: Bool[Array, "rows"] | None = None  # whether a row holds a finger that is away; None: no row does
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -92,17 +96,24 @@ class ContactFormation(eqx.Module):
         )
         rolling = [*tangential[1:], False]
         rows = zip(link, kind, feature, rolling, tangential, strict=True)
-        return tuple(contact_name(*row[:3], rolling=row[3]) for row in rows if not row[4])
+        return tuple(contact_name(*row[:3], rolling=row[3]) for row in rows if not row[4] and row[1] != AWAY)
+
+    @property
+    def away(self) -> tuple[str, ...]:
+        """The fingers that are away, as files write them: `finger1:away`."""
+        rows = zip(np.asarray(self.link).tolist(), np.asarray(self.kind).tolist(), strict=True)
+        return tuple(contact_name(link, kind, 0) for link, kind in rows if kind == AWAY)
 
     @property
     def normal_rows(self) -> tuple[int, ...]:
         """The row of each contact's gap."""
-        return tuple(np.flatnonzero(~np.asarray(self.tangential)).tolist())
+        return tuple(np.flatnonzero(~np.asarray(self.tangential) & (np.asarray(self.kind) != AWAY)).tolist())
 
     @property
     def contact_of_row(self) -> tuple[int, ...]:
-        """Which of `names` each row belongs to."""
-        return tuple((np.cumsum(~np.asarray(self.tangential)) - 1).tolist())
+        """Which of `names` each row belongs to; that of a finger that is away repeats the first contact's force."""
+        rows = np.cumsum(~np.asarray(self.tangential)) - 1
+        return tuple(np.where(np.asarray(self.kind) == AWAY, 0, rows).tolist())
 
 
 class PathTarget(eqx.Module):
@@ -129,13 +140,18 @@ class Arrival(enum.IntEnum):
 
 
 class Phase(eqx.Module):
-    """One contact formation, the direction of travel, the time [s] that it may take, and how it must end."""
+    """One contact formation, the direction of travel, the time [s] that it may take, and how it must end.
+
+    `regrasp` names the contact that a finger makes which moves alone while the others hold the object (or
+    `finger1:away`); None for any other phase.
+    """
 
     name: str = eqx.field(static=True)
     formation: ContactFormation
     target: PathTarget
     duration: Float[Array, ""]
     arrive: Arrival = eqx.field(static=True, default=Arrival.AT_REST)
+    regrasp: str | None = eqx.field(static=True, default=None)
 
 
 class Scene(eqx.Module):
@@ -184,11 +200,34 @@ def polygon(vertices, mass, friction, inertia=None, center_of_mass=None, flush_t
 
 
 def contact_formation(contacts) -> ContactFormation:
-    """Build a `ContactFormation` from contact names such as `"palm:v5"`, `"finger2:e3"` or `"palm:v6 rolling"`."""
+    """Build a `ContactFormation` from contact names such as `"palm:v5"`, `"finger2:e3"` or `"palm:v6 rolling"`.
+
+    `"finger1:away"` stands for a finger that touches nothing and stands still.
+    """
     rows = []
-    for *feature, rolling in map(parse_contact, contacts):
+    for *feature, rolling in sorted(map(parse_contact, contacts), key=lambda row: row[1] == AWAY):
         rows += [(*feature, tangential) for tangential in (False, True)[: 1 + rolling]]
-    return ContactFormation(*(as_device_array(column) for column in zip(*rows, strict=True)))
+    formation = ContactFormation(*(as_device_array(column) for column in zip(*rows, strict=True)))
+    is_away = [row[1] == AWAY for row in rows]
+    return eqx.tree_at(_away_rows, formation, as_device_array(is_away), is_leaf=_is_none) if any(is_away) else formation
+
+
+def alike_formations(formations: Sequence[ContactFormation]) -> tuple[ContactFormation, ...]:
+    """Return formations that can be stacked: if a finger is away in one of them, all say of each row whether it is."""
+    if all(one.is_away is None for one in formations):
+        return tuple(formations)
+    return tuple(
+        eqx.tree_at(_away_rows, one, one.kind == AWAY, is_leaf=_is_none) if one.is_away is None else one
+        for one in formations
+    )
+
+
+def _away_rows(formation: ContactFormation):
+    return formation.is_away
+
+
+def _is_none(leaf) -> bool:
+    return leaf is None
 
 
 def path_target(toward: str | None, until: Mapping[Any, float] | None = None) -> PathTarget:
@@ -205,7 +244,13 @@ def path_target(toward: str | None, until: Mapping[Any, float] | None = None) ->
 
 
 def parse_contact(text: str) -> tuple[int, int, int, bool]:
-    """`"finger2:e3 rolling"` -> (link, kind, feature, rolling). Raises ValueError for anything else."""
+    """`"finger2:e3 rolling"` -> (link, kind, feature, rolling); `"finger1:away"` -> (1, AWAY, 0, False).
+
+    Raises ValueError for anything else.
+    """
+    parked = _AWAY_PATTERN.fullmatch(text.strip())
+    if parked is not None:
+        return LINKS.index(parked.group(1)), AWAY, 0, False
     match = _CONTACT_PATTERN.fullmatch(text.strip())
     if match is None:
         raise ValueError(f"'{text}' is not a contact; write LINK:vN or LINK:eN, e.g. palm:v5 or finger2:e3")
@@ -222,6 +267,8 @@ def feature_pair(contact: str) -> str:
 
 def contact_name(link: int, kind: int, feature: int, *, rolling: bool = False) -> str:
     """The inverse of `parse_contact`."""
+    if kind == AWAY:
+        return f"{LINKS[link]}:away"
     return f"{LINKS[link]}:{'v' if kind == VERTEX else 'e'}{feature}" + (" rolling" if rolling else "")
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from wholearm_jax.core import Status, as_device_array, computed_at_once, is_traced, stack_trees, unstack_trees
 from wholearm_jax.dynamics import PathDynamics
-from wholearm_jax.model import Arrival, Phase, Scene, rigid_body, scaled_mechanics
+from wholearm_jax.model import Arrival, Phase, Scene, alike_formations, rigid_body, scaled_mechanics
 from wholearm_jax.phases.phase_ends import target_configuration
 from wholearm_jax.phases.phase_tracing import TracedPhase, trace_phase, trace_phase_path
 from wholearm_jax.tracing import ContactPath, Resolution
@@ -168,7 +168,9 @@ def _scan_phases(trace_one, scene: Scene, resolution: Resolution):
         traced, begin, end = trace_one(formation, initial_guess, target, resolution, first, holds)
         return (jnp.where(holds, begin, end), jnp.asarray(False)), traced
 
-    phases = stack_trees([(p.formation, p.target, jnp.asarray(p.arrive is Arrival.HOLD)) for p in scene.phases])
+    formations = alike_formations([p.formation for p in scene.phases])
+    each = zip(formations, scene.phases, strict=True)
+    phases = stack_trees([(one, p.target, jnp.asarray(p.arrive is Arrival.HOLD)) for one, p in each])
     return jax.lax.scan(step, (scene.start, jnp.asarray(True)), phases)[1]
 
 

@@ -108,6 +108,7 @@ def event_functions(mechanics: ScaledMechanics, target: PathTarget, z: Float[Arr
     def rows(of_pairs, before, behind, of_coordinate, of_links):
         return jnp.concatenate([of_pairs, before, behind, jnp.reshape(of_coordinate, 1), of_links])
 
+    held = eqx.tree_at(lambda c: c.is_away, held, None, is_leaf=lambda leaf: leaf is None)  # their limits say so
     contacts = jax.tree.map(
         lambda a, b, c: rows(a, b, b, b[0], c),
         *(_with_carrier(each) for each in (pairs, held, links.contacts)),
