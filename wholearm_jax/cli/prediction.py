@@ -58,7 +58,8 @@ def _gap_function(scene):
         kinematics, residual = contact_kinematics(contacts, z), jax.numpy.abs(constraints(contacts, z))
         outside = jax.numpy.maximum(contacts.lower - kinematics.along, kinematics.along - contacts.upper)
         distance = jax.numpy.hypot(kinematics.gap, jax.numpy.maximum(0.0, outside))
-        gap = jax.numpy.where(contacts.tangential, residual, distance)
+        is_angle = contacts.tangential if contacts.is_away is None else contacts.tangential | contacts.is_away
+        gap = jax.numpy.where(is_angle, residual, distance)
         return gap, mechanics.length, mechanics.configuration_unit
 
     return gaps

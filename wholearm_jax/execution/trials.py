@@ -207,6 +207,8 @@ def _touch_down(shape, hand, gravity, formation: ContactFormation, z, shift) -> 
     mechanics = scaled_mechanics(rigid_body(shape), hand, gravity, formation)
     displaced = z / mechanics.configuration_unit + jnp.zeros(5).at[:3].set(shift / mechanics.length)
     is_gap = ~formation.tangential  # the second row of a rolling contact repeats its gap
+    if formation.is_away is not None:
+        is_gap = is_gap & ~formation.is_away
 
     def closer(_, z):
         rows = jnp.where(is_gap[:, None], normal_jacobian(mechanics.contacts, z), 0.0)

@@ -34,7 +34,7 @@ class RestInterval(NamedTuple):
 
 def rest_margin(balance: Statics, schedule: TorqueSchedule, start: float, end: float) -> RestInterval:
     """Compute the margin of an object at rest from `start` to `end` [s] under a schedule, exactly."""
-    times, torques = _corners(schedule, start, end)
+    times, torques = schedule_corners(schedule, start, end)
     margins = [balance.margin_under(torque) for torque in torques]
     worst = int(np.argmin([each.margin for each in margins]))
     floor = FEASIBILITY_TOL * balance.unit
@@ -47,7 +47,7 @@ def rest_margin(balance: Statics, schedule: TorqueSchedule, start: float, end: f
     return RestInterval(start, end, margins[worst].margin, times[worst], margins[lost].contact, loss_time)
 
 
-def _corners(schedule: TorqueSchedule, start: float, end: float):
+def schedule_corners(schedule: TorqueSchedule, start: float, end: float) -> tuple[list[float], list[np.ndarray]]:
     """Return times and torques between which a schedule is linear.
 
     A jump has both its sides, except one at `start` or `end`: there only the side within counts.

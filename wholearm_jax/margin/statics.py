@@ -10,7 +10,7 @@ Where no forces are possible, it is minus the least adhesion `a` with which some
 are concave functions of the torque. Derivation: section 4 of `docs/derivation.md`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -179,6 +179,13 @@ def contact_statics(scene: Scene, formation: ContactFormation, z: Float[Array | 
         torque_limit=np.asarray(mechanics.torque_limit),
         unit=unit,
     )
+
+
+def without_joint(statics: Statics, finger: int) -> Statics:
+    """Return the balance without that of finger 1's or 2's joint, which moves."""
+    wrench, load = statics.wrench.copy(), statics.load.copy()
+    wrench[2 + finger], load[2 + finger] = 0.0, 0.0
+    return replace(statics, wrench=wrench, load=load)
 
 
 @jax.jit

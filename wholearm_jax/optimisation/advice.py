@@ -159,7 +159,7 @@ def _explain_negative_bound(phase: PhaseResult, bound: MarginBound, traced: Trac
 def _negative_bound(phase: PhaseResult, bound: MarginBound, traced: TracedPhase) -> str:
     """Name the place at which a phase's bound is negative, and the contacts whose forces are the least there."""
     z, forces = (np.asarray(a) for a in _forces_at_best_torque(traced.dynamics, bound.s))
-    rows = np.flatnonzero(~np.asarray(traced.dynamics.tangential))
+    rows = np.flatnonzero(~np.asarray(traced.dynamics.tangential))[: len(phase.contacts)]
     pulling = [name for name, row in zip(phase.contacts, rows, strict=True) if forces[row] < 0]
     whose = f": {' and '.join(pulling)} would have to pull" if pulling else ""
     place = "at its start" if float(bound.path_fraction) == 0 else f"{100 * float(bound.path_fraction):.0f} % along it"

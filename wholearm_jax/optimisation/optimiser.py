@@ -44,9 +44,17 @@ import equinox as eqx
 import numpy as np
 import optax
 
-from wholearm_jax.core import Status, on_host, require_positive, require_x64, wait_for
+from wholearm_jax.core import Status, as_device_array, on_host, require_positive, require_x64, wait_for
 from wholearm_jax.margin import MarginBound
-from wholearm_jax.model import Arrival, Scene, TorqueSchedule, concatenate_schedules, replace_duration, uniform_schedule
+from wholearm_jax.model import (
+    Arrival,
+    Phase,
+    Scene,
+    TorqueSchedule,
+    concatenate_schedules,
+    replace_duration,
+    uniform_schedule,
+)
 from wholearm_jax.optimisation.advice import Search, explain
 from wholearm_jax.optimisation.best_motion import convex_bounds
 from wholearm_jax.optimisation.convex_start import ConvexStart, convex_starts
@@ -64,7 +72,15 @@ from wholearm_jax.optimisation.quasistatic_plan import bounds, require_knots
 from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.optimisation.shortest_plan import shortest_plan
 from wholearm_jax.optimisation.solver import IterationRecord
-from wholearm_jax.phases import Result, TracedPhase, build_result, group_phases, simulate_phases, trace
+from wholearm_jax.phases import (
+    Result,
+    TracedPhase,
+    build_result,
+    group_phases,
+    idle_torques,
+    simulate_phases,
+    trace,
+)
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
 MAX_DWELLS = (0.25, 0.1)  # fractions of a phase for which the object may wait before it starts, at limited rates
@@ -149,6 +165,9 @@ def optimise(
     require_knots(knots)
     rate_limit = None if rate_limit == np.inf else rate_limit
     require_positive(steps=steps, tolerance=tolerance, rate_limit=np.inf if rate_limit is None else rate_limit)
+    parked = next((phase.name for phase in scene.phases if phase.formation.away), None)
+    if rate_limit is not None and parked is not None:
+        raise ValueError(f"rate_limit: in phase '{parked}' a finger is away, whose torque jumps to zero")
     if margin is not None and (durations is not None or not margin >= 0):
         raise ValueError("margin is a number of at least 0, and excludes durations")
     if durations is not None and not 0 < durations[0] <= durations[1]:
@@ -208,6 +227,7 @@ def _solve_plan(
         solve_group = partial(_solve_group, scene, traced, limits, options)
         solutions = list(threads.map(solve_group, groups, itertools.pairwise([None, *transitions, None])))
     schedules = [schedule for found in solutions for schedule in found.schedules]
+    schedules = [_without_idle_torques(*each) for each in zip(scene.phases, schedules, strict=True)]
     stopped = [found.reason for found in solutions for _ in found.schedules]
     history = [record for found in solutions for record in found.history]
 
@@ -254,6 +274,13 @@ def _solve_group(
             break
     best = max(solutions, key=lambda found: found.score)
     return best._replace(history=[record for found in solutions for record in found.history])
+
+
+def _without_idle_torques(phase: Phase, schedule: TorqueSchedule) -> TorqueSchedule:
+    """Return a phase's schedule without torques of fingers that are away, which have no effect on its path."""
+    if not phase.formation.away:
+        return schedule
+    return TorqueSchedule(schedule.times, as_device_array(idle_torques(phase, np.asarray(schedule.values))))
 
 
 def _one_at_a_time(callback: Callable[[IterationRecord], None]) -> Callable[[IterationRecord], None]:

@@ -16,7 +16,7 @@ from wholearm_jax.margin import (
 from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, concatenate_schedules, uniform_schedule
 from wholearm_jax.optimisation.initial_guess import initial_guesses, transformed_rest_to_rest_torques
 from wholearm_jax.optimisation.plan_transitions import holding_schedule
-from wholearm_jax.phases import TracedPhase, starts_at_rest, statics_at_start, trace
+from wholearm_jax.phases import TracedPhase, idle_torques, starts_at_rest, statics_at_start, trace
 
 
 def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[TracedPhase, ...] = ()) -> TorqueSchedule:
@@ -72,7 +72,8 @@ def _quasistatic_of_numbers(scene: Scene, knots: int, traced: tuple[TracedPhase,
         if phase.arrive is Arrival.HOLD:
             return holding_schedule(scene, phase, path, knots)
         guess = initial_guesses([path.dynamics], [float(phase.duration)], knots, 1.0)[0]
-        return uniform_schedule(float(phase.duration), path.dynamics.torque_limit * guess.torque[0])
+        torque = path.dynamics.torque_limit * guess.torque[0]
+        return uniform_schedule(float(phase.duration), idle_torques(phase, torque))
 
     return concatenate_schedules([schedule(*pair) for pair in zip(traced, scene.phases, strict=True)])
 

@@ -24,6 +24,7 @@ from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, pad_schedu
 from wholearm_jax.phases import (
     Result,
     TracedPhase,
+    idle_torques,
     precompile_simulation,
     require_motion,
     simulate,
@@ -87,6 +88,7 @@ def search_by_steps(scene: Scene, *, longest: float = 10.0, traced: tuple[Traced
     phases, times, rows, start, count = [], [], [], 0.0, 0
     for phase, path in zip(scene.phases, traced, strict=True):
         torque, duration, simulations = _search_phase(path, longest)
+        torque = idle_torques(phase, torque)
         count += simulations
         phases.append(_with_any_speed(replace_duration(phase, duration)))
         times += [start, start + duration]
@@ -104,7 +106,8 @@ def precompile_search() -> BackgroundTask:
 
 
 def _with_any_speed(phase: Phase) -> Phase:
-    return Phase(phase.name, phase.formation, phase.target, phase.duration, arrive=Arrival.ANY_SPEED)
+    ends = {"arrive": Arrival.ANY_SPEED, "regrasp": phase.regrasp}
+    return Phase(phase.name, phase.formation, phase.target, phase.duration, **ends)
 
 
 def _search_phase(path: TracedPhase, longest: float) -> tuple[np.ndarray, float, int]:

@@ -15,6 +15,7 @@ from wholearm_jax.phases.obstacles import describe_refused_start
 from wholearm_jax.phases.phase_ends import configuration, describe_end
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.phase_tracing import TracedPhase
+from wholearm_jax.phases.standing_fingers import find_standing_defect, hold_during_regrasp
 
 SLIP_TOL = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
 REFUSED_STARTS = (Status.LEFT_FORMATION, Status.OBSTACLE)  # statuses of a path that mean that it cannot begin
@@ -130,13 +131,13 @@ def build_result(scene: Scene, torque: TorqueSchedule, traced, found) -> Result:
             margin_s=float(scored.s),
             margin_contact=names[of_slot[int(scored.contact)]],
             impulses=tuple(float(np.asarray(outcome.impact.impulse)[k]) for k in phase.formation.normal_rows),
-            holds=rest_intervals(scene, torque, phase, at, outcome),
+            holds=_holds(scene, torque, phase, at, outcome),
             traced=at,
             outcome=outcome,
             detail=_detail(scene, phase, at, Status(int(assessment.status))),
             remedy=path_remedy(phase, at),
         )
-        rows.append(_with_holds(one))
+        rows.append(_with_standing_fingers(scene, torque, phase, _with_holds(one)))
     return Result(scene, torque, tuple(rows))
 
 
@@ -180,6 +181,26 @@ def rest_intervals(
         begin, end = (start + duration * float(share) for share in motion.phase_time[k : k + 2])
         found.append(rest_margin(contact_statics(scene, phase.formation, z), torque, begin, end))
     return tuple(found)
+
+
+def _holds(
+    scene: Scene, torque: TorqueSchedule, phase: Phase, traced: TracedPhase, outcome: SimulatedPhase
+) -> tuple[RestInterval, ...]:
+    """Every time that the object is held at rest: in a regrasp, in which one finger alone moves, all the time."""
+    if phase.regrasp is None or int(traced.dynamics.status) != Status.OK:
+        return rest_intervals(scene, torque, phase, traced, outcome)
+    return (hold_during_regrasp(scene, torque, phase, traced, float(outcome.start), float(outcome.duration)),)
+
+
+def _with_standing_fingers(scene: Scene, torque: TorqueSchedule, phase: Phase, one: PhaseResult) -> PhaseResult:
+    """Judge a phase in which a finger is away or moves alone; return any other phase as it is."""
+    known = int(one.traced.dynamics.status) == Status.OK
+    if not known or (phase.regrasp is None and not phase.formation.away):
+        return one
+    defect = find_standing_defect(scene, torque, phase, one.traced, one.start, one.duration)
+    if defect is None or (one.status is not Status.OK and one.time < defect.time):
+        return one
+    return replace(one, status=defect.status, time=defect.time, contact=None, slips=False, detail=defect.detail)
 
 
 def _with_holds(phase: PhaseResult) -> PhaseResult:

@@ -69,6 +69,11 @@ def sample_phase(
     return Trajectory(start + duration * phase_times, *jax.vmap(one)(phase_times))
 
 
+def _of_contacts(forces: np.ndarray, count: int) -> np.ndarray:
+    """Return the forces with NaN behind the last of `count` contacts."""
+    return np.where(np.arange(forces.shape[1]) < count, forces, np.nan)
+
+
 @on_host("sample outside of the transformation")
 def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
     """Every phase at `samples` evenly spaced times; a phase that failed stops there, and later ones are left out.
@@ -94,7 +99,9 @@ def trajectory(result: Result, samples: int = 201) -> tuple[Trajectory, ...]:
         course = sample_phase(
             phase.traced.dynamics, schedule, outcome.start, outcome.duration, outcome.motion, phase_times
         )
-        found.append(jax.tree.map(lambda a: a[:samples], jax.device_get(course)))
+        course = jax.tree.map(lambda a: a[:samples], jax.device_get(course))
+        cn, ct = (_of_contacts(forces, len(phase.contacts)) for forces in (course.cn, course.ct))
+        found.append(course._replace(cn=cn, ct=ct))
         if phase.status is not Status.OK:
             break
     return tuple(found)
