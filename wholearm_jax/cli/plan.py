@@ -24,6 +24,10 @@ HAND_HELP = (
     "Search for the hand, too: ranges of finger length and of each joint's distance from the middle [m], "
     'such as "length=0.08:0.20,joint=0.03:0.08".'
 )
+REGRASP_HELP = (
+    "Allow regrasps, in which a finger leaves the object and touches it again: each time that a finger moves alone "
+    "counts as so many phases more."
+)
 COLUMNS = ("phase", "contacts", "toward", "until")
 NUMBERS = ("from x, y mm", "phi deg", "to x, y mm", "phi deg", "turn deg", "bound N")
 
@@ -38,6 +42,7 @@ def plan(
     phases: Annotated[int, typer.Option(min=1, help="Longest plan.")] = 5,
     time: Annotated[float, typer.Option(min=0.0, help="Seconds after which the search ends with what it has.")] = 60.0,
     rolling: Annotated[bool, typer.Option(help="Whether contacts may roll.")] = True,
+    regrasp_cost: Annotated[float | None, typer.Option(min=0.0, help=REGRASP_HELP)] = None,
     hand_from: Annotated[str | None, typer.Option(help=HAND_HELP)] = None,
     out: Annotated[
         Path | None,
@@ -54,6 +59,7 @@ def plan(
     loaded, folder = load_start(scene), make_output_folder(out)
     wanted = _goal(scene, load_goal(scene), goal, by, tolerance)
     limits = {"margin": margin, "count": count, "max_phases": phases, "rolling": rolling, "time_limit": time}
+    limits |= {"regrasp_cost": regrasp_cost}
     try:
         make_goal(loaded.start, **wanted)  # refused before anything is shown
         with solver_progress() as progress:

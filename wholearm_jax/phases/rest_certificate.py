@@ -83,6 +83,9 @@ def _certify_interval(
     def within(sign):
         matrix, right = equations_of_motion(mechanics, z, x, jnp.zeros_like(x), sign * sliding, sign * jnp.sign(x[3:]))
         solved = fused_matmul(inverse_and_determinant(matrix)[0], right[:, jnp.array([0, 3, 4])])[1:]
+        is_away = mechanics.contacts.is_away
+        if is_away is not None:  # what holds a finger that is away is no contact's force
+            solved = jnp.where(is_away[:, None], solved[:1], solved)
         return jax.vmap(lambda one: force_slack(dynamics, fused_matmul(solved, one)))(terms).min() >= 0
 
     return jax.lax.map(within, jnp.array([1.0, -1.0])).all()

@@ -16,6 +16,7 @@ from wholearm_jax.margin import best_quasistatic_torque
 from wholearm_jax.model import (
     ContactFormation,
     Scene,
+    alike_formations,
     contact_formation,
     path_target,
     rigid_body,
@@ -27,6 +28,7 @@ from wholearm_jax.tracing import Resolution
 
 MOVES_PER_CALL = 8  # paths that one call of the program traces; the last call is filled up
 PLACES = 33  # configurations of a path that are kept
+AWAY_NAMES = ("finger1:away", "finger2:away")
 RESOLUTION = Resolution(panels=16)  # of the planner's tables: forces to three digits
 
 
@@ -54,7 +56,12 @@ class _Paths(NamedTuple):
 
 
 def moves_from(
-    scene: Scene, z: Float[Array, "5"], touching: Sequence[str] | None = None, *, rolling: bool = True
+    scene: Scene,
+    z: Float[Array, "5"],
+    touching: Sequence[str] | None = None,
+    *,
+    rolling: bool = True,
+    regrasps: bool = False,
 ) -> tuple[Move, ...]:
     """Return all moves from a configuration: formations `2R + S = 4` of what touches, sliding and rolling, both ways.
 
@@ -63,14 +70,15 @@ def moves_from(
         z: the configuration (5,), SI.
         touching: the contacts to combine; those that touch at `z` unless given.
         rolling: whether contacts may roll.
+        regrasps: whether a finger may be away.
     """
     names = touching_contacts(scene, z) if touching is None else touching
-    chosen = [*path_choices(scene, z, names, rolling=rolling)]
+    chosen = [*path_choices(scene, z, names, rolling=rolling, away=AWAY_NAMES if regrasps else ())]
     parts = [chosen[first : first + MOVES_PER_CALL] for first in range(0, len(chosen), MOVES_PER_CALL)]
     if not parts:
         return ()
-    first, others = _trace(scene, z, parts[0]), parts[1:]  # compiles, once
-    traced = [first, *_threads().map(functools.partial(_trace, scene, z), others)]
+    first, others = _trace(scene, z, regrasps, parts[0]), parts[1:]  # compiles, once
+    traced = [first, *_threads().map(functools.partial(_trace, scene, z, regrasps), others)]
     moves = []
     for part, paths in zip(parts, traced, strict=True):
         for k, (contacts, toward) in enumerate(part):
@@ -92,10 +100,13 @@ def _formation(contacts: tuple[str, ...]) -> ContactFormation:
     return contact_formation(contacts)
 
 
-def _trace(scene: Scene, z, chosen) -> _Paths:
+def _trace(scene: Scene, z, regrasps: bool, chosen) -> _Paths:
     """Trace the paths of at most `MOVES_PER_CALL` choices; the first is repeated to fill up the call."""
     chosen = [*chosen, *chosen[:1] * (MOVES_PER_CALL - len(chosen))]
-    formations = jax.tree.map(lambda *rows: np.stack(rows), *(_formation(contacts) for contacts, _ in chosen))
+    every = [_formation(contacts) for contacts, _ in chosen]
+    if regrasps:  # one program, whether or not a finger is away in one of them
+        every = alike_formations([*every, _formation(("finger1:away",))])[:-1]
+    formations = jax.tree.map(lambda *rows: np.stack(rows), *every)
     targets = [path_target(toward) for _, toward in chosen]
     stacked = jax.tree.map(lambda *rows: np.stack(rows), *targets)
     as_arrays = functools.partial(jax.tree.map, jnp.asarray)

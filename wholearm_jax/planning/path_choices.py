@@ -11,6 +11,7 @@ from wholearm_jax.core import CachedJit
 from wholearm_jax.margin import MAX_ROLLING
 from wholearm_jax.model import (
     COORDINATES,
+    LINKS,
     Scene,
     constraint_jacobian,
     contact_formation,
@@ -32,8 +33,19 @@ def formation_names(contacts: Sequence[str], rolling: bool) -> Iterator[tuple[st
                 yield *(f"{name} rolling" for name in rolls), *slides
 
 
+def _is_possible(names: Sequence[str]) -> bool:
+    """Whether at most one finger is away, and that one has no contact and does not roll."""
+    away = [name for name in names if name.endswith(":away")]
+    finger = away[0].partition(":")[0] if away else None
+    return (
+        len(away) <= 1
+        and not any(name.endswith(":away rolling") for name in names)
+        and (finger is None or sum(name.startswith(finger) for name in names) == 1)
+    )
+
+
 def path_choices(
-    scene: Scene, z: Float[Array, "5"], contacts: Sequence[str], *, rolling: bool
+    scene: Scene, z: Float[Array, "5"], contacts: Sequence[str], *, rolling: bool, away: Sequence[str] = ()
 ) -> Iterator[tuple[tuple[str, ...], str]]:
     """Yield each formation of contacts whose constraints fix a path, with either direction along it.
 
@@ -42,12 +54,13 @@ def path_choices(
         z: the configuration (5,), SI.
         contacts: names of the contacts to combine, as if none rolled.
         rolling: whether contacts may roll.
+        away: fingers that may stand still without a contact, such as `finger1:away`.
 
     Yields:
         The names of a formation's contacts and the direction as scene files write it, by the coordinate that changes
         most: `("palm:v5", ...), "x-"`.
     """
-    combinations = tuple(formation_names(contacts, rolling))
+    combinations = tuple(names for names in formation_names([*contacts, *away], rolling) if _is_possible(names))
     directions = _path_directions(scene, z, contacts, combinations) if combinations else ()
     for names, direction in zip(combinations, directions, strict=True):
         if direction is not None:
@@ -63,6 +76,7 @@ def _path_directions(scene: Scene, z, contacts: Sequence[str], combinations) -> 
     every = contact_formation([f"{name} rolling" for name in padded])
     rows = np.asarray(_constraint_rows(rigid_body(scene.object), scene.hand, scene.gravity, every, jnp.asarray(z)))
     rows_of = {name: rows[2 * k : 2 * k + 2] for k, name in enumerate(contacts)}
+    rows_of |= {f"{finger}:away": np.eye(5)[2 + k : 3 + k] for k, finger in enumerate(LINKS) if k > 0}
     # A path's direction is the null vector of its four rows.
     stacked = np.stack([np.concatenate([_rows_held(rows_of, name) for name in names]) for names in combinations])
     _, values, right = np.linalg.svd(stacked)

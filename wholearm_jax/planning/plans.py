@@ -24,6 +24,7 @@ class Step:
     until: tuple[str, float] | None  # a coordinate and its value; None: the path's end
     end: np.ndarray  # (5,) `z` (SI)
     margin: float  # [N], least on the way, at rest
+    regrasp: str | None = None  # what a finger does that moves alone, as scene files write it
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,7 @@ def make_plan(
             contact_formation(step.contacts),
             path_target(step.toward, dict([step.until]) if step.until else None),
             as_device_array(duration),
+            regrasp=step.regrasp,
         )
         for k, step in enumerate(steps)
     )

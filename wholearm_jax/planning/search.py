@@ -19,12 +19,13 @@ import equinox as eqx
 import numpy as np
 
 from wholearm_jax.core import as_device_array, require_x64
-from wholearm_jax.model import ANGLE_COORDINATES, COORDINATES, Scene, rigid_body
+from wholearm_jax.model import ANGLE_COORDINATES, COORDINATES, Scene, feature_pair, rigid_body
 from wholearm_jax.phases import trace
 from wholearm_jax.planning.goal import Goal, make_goal
-from wholearm_jax.planning.moves import Move, moves_from
+from wholearm_jax.planning.moves import AWAY_NAMES, Move, moves_from
 from wholearm_jax.planning.obstructions import explain_failure
 from wholearm_jax.planning.plans import Edge, Plan, PlanningResult, Step, make_plan
+from wholearm_jax.planning.regrasps import regrasp_stops, separate_regrasps
 from wholearm_jax.planning.successors import touching_contacts
 
 STOPS = (1 / 3, 2 / 3)  # fractions of a path at which other moves may begin
@@ -49,6 +50,7 @@ class _Search:
     duration: float
     count: int
     rolling: bool
+    regrasp_cost: float | None
     queue: list[Any] = field(default_factory=list)
     visited: set[tuple[int, ...]] = field(default_factory=set)
     order: Any = field(default_factory=itertools.count)
@@ -70,6 +72,7 @@ def plan(
     count: int = 3,
     max_phases: int = 5,
     rolling: bool = True,
+    regrasp_cost: float | None = None,
     time_limit: float = 60.0,
     max_nodes: int | None = None,
     duration: float = 1.0,
@@ -86,6 +89,9 @@ def plan(
         count: number of plans to return at most.
         max_phases: longest plan.
         rolling: whether contacts may roll.
+        regrasp_cost: allow regrasps: a finger may leave the object, stand still away from it while the other one moves
+            the object, and touch it again. Each time that a finger moves alone counts as so many phases more. None: no
+            regrasps.
         time_limit: seconds of search, compiling left out, after which it ends with what it has.
         max_nodes: configurations to expand at most: unlike time, the same on every machine.
         duration: of each phase [s].
@@ -100,6 +106,8 @@ def plan(
         RuntimeError: without float64.
     """
     require_x64(scene)
+    if regrasp_cost is not None and not 0 <= regrasp_cost < np.inf:
+        raise ValueError(f"regrasp_cost must be a number of at least 0, not {regrasp_cost}")
     start, touching = _start(scene)
     search = _Search(
         scene=scene,
@@ -111,6 +119,7 @@ def plan(
         duration=duration,
         count=count,
         rolling=rolling,
+        regrasp_cost=regrasp_cost,
     )
     _push(search, start, (), touching)
     out_of_time = _run(search, time_limit, max_nodes, callback)
@@ -119,7 +128,7 @@ def plan(
         steps = search.nearest[1]
         nearest = make_plan(scene, start, steps, duration, None) if steps else None
         here = nearest.ends[-1] if nearest is not None else start
-        moves = moves_from(scene, as_device_array(here), rolling=rolling)
+        moves = moves_from(scene, as_device_array(here), rolling=rolling, regrasps=regrasp_cost is not None)
         nearer = [move for move in moves if _phases_to_go(search, move.places[1]) < _phases_to_go(search, here) - 1e-6]
         reason = explain_failure(search.goal, here, nearer, search.floor, out_of_time=out_of_time)
     return PlanningResult(
@@ -170,7 +179,7 @@ def _add_plan(search: _Search, steps: tuple[Step, ...]) -> None:
     found = make_plan(search.scene, search.start, steps, search.duration, search.goal)
     if found is None or found.bound <= search.floor:
         return
-    ranked = sorted([*search.plans, found], key=lambda one: (-round(one.bound, 6), len(one.steps)))
+    ranked = sorted([*search.plans, found], key=lambda one: (-round(one.bound, 6), _cost(search, one.steps)))
     different = {}  # plans of the same formations that change elsewhere are one
     for one in ranked:
         different.setdefault(tuple((step.contacts, step.toward) for step in one.steps), one)
@@ -192,7 +201,12 @@ def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tup
     distance = _phases_to_go(search, z)
     if distance < search.nearest[0] - 1e-9:
         search.nearest = (distance, steps)
-    heapq.heappush(search.queue, (len(steps) + distance, next(search.order), z, steps, touching))
+    heapq.heappush(search.queue, (_cost(search, steps) + distance, next(search.order), z, steps, touching))
+
+
+def _cost(search: _Search, steps: tuple[Step, ...]) -> float:
+    """Count phases, each regrasp with its price."""
+    return len(steps) + (search.regrasp_cost or 0.0) * sum(step.regrasp is not None for step in steps)
 
 
 def _phases_to_go(search: _Search, z: np.ndarray) -> float:
@@ -205,22 +219,26 @@ def _phases_to_go(search: _Search, z: np.ndarray) -> float:
 
 def _expand(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching) -> None:
     """Trace all moves from a configuration and push the places at which they may be left."""
-    moves = moves_from(search.scene, as_device_array(z), touching, rolling=search.rolling)
+    regrasps = search.regrasp_cost is not None
+    moves = moves_from(search.scene, as_device_array(z), touching, rolling=search.rolling, regrasps=regrasps)
     search.nodes += 1
     search.moves += len(moves)
     previous = steps[-1].contacts if steps else None
-    for move in moves:
-        if move.contacts == previous:  # on or back along the same path: no new move
-            continue
-        for step, is_end in _stops(search, move):
-            if step.margin > search.floor:
-                search.graph.append(Edge(z, step.end, step.margin))
-                _push(search, step.end, (*steps, step), None if is_end else _names(move))
+    alone, others = separate_regrasps(moves) if regrasps else ((), moves)
+    # On or back along the same path is no new move.
+    stops = [(move, stop) for move in others if move.contacts != previous for stop in _stops(search, move)]
+    last = steps[-1].regrasp if steps else None
+    capacity = search.scene.object.vertices.shape[0]
+    stops += [(move, stop) for move in alone for stop in regrasp_stops(move, capacity, last)]
+    for move, (step, is_end) in stops:
+        if step.margin > search.floor:
+            search.graph.append(Edge(z, step.end, step.margin))
+            _push(search, step.end, (*steps, step), None if is_end else _names(move))
 
 
 def _names(move: Move) -> tuple[str, ...]:
     """Name the contacts that touch between the ends of a path."""
-    return tuple(name.partition(" ")[0] for name in move.contacts)
+    return tuple(feature_pair(name) for name in move.contacts if name not in AWAY_NAMES)
 
 
 def _stops(search: _Search, move: Move) -> Iterator[tuple[Step, bool]]:
