@@ -60,9 +60,11 @@ def _find_path_defect(scene: Scene, phase: Phase, traced: TracedPhase) -> tuple[
     moved[2 + regrasp_finger(phase.regrasp)] = 0.0
     if moved.max() > STAYS:
         return Status.LEFT_FORMATION, f"{' '.join(phase.formation.names)} do not hold the object while the finger moves"
+    end = describe_end(scene, phase, traced)
+    if bool(traced.dynamics.ends_at_obstacle):
+        return Status.OBSTACLE, end
     if phase.regrasp.endswith(":away"):
         return None
-    end = describe_end(scene, phase, traced)
     made = int(traced.path.end_reason) == PathEnd.CONTACT_MADE
     if made and end != f"{phase.regrasp} is made":
         return Status.OBSTACLE, f"{end} before {phase.regrasp}"

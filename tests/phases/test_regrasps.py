@@ -1,0 +1,237 @@
+"""Fingers that are away and regrasps: statics against a programme of the test's own, paths, refusals, executions."""
+
+import copy
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+import wholearm_jax as wa
+from wholearm_jax.core import SceneError
+from wholearm_jax.execution.executions import ExecutionOutcome, execute
+from wholearm_jax.files import load_start
+from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.margin import contact_statics, without_joint
+from wholearm_jax.model import contact_formation
+from wholearm_jax.phases import describe_end
+
+
+def scene_data():
+    """The bundled heptagon at rest on an edge, without phases."""
+    data = to_dict(wa.load("heptagon"))
+    begin = np.asarray(wa.trace(wa.load("heptagon"))[0].begin).tolist()
+    return data | {"start": dict(zip(("x", "y", "phi", "theta1", "theta2"), begin, strict=True))}
+
+
+def hand_over_hand():
+    """Finger 1 opens, finger 2 pushes the object, finger 1 closes on it again."""
+    hold = ["palm:v3", "palm:v4", "finger2:v2"]
+    return [
+        {"name": "open", "contacts": hold, "regrasp": "finger1:away", "until": {"theta1": 0.9}, "duration": 0.5},
+        {"name": "push", "contacts": [*hold, "finger1:away"], "toward": "x+", "duration": 1.0},
+        {"name": "close", "contacts": hold, "regrasp": "finger1:v6", "duration": 0.5},
+    ]
+
+
+@pytest.fixture(scope="module")
+def data():
+    return scene_data() | {"phase": hand_over_hand()}
+
+
+@pytest.fixture(scope="module")
+def optimum(data):
+    return wa.optimise(wa.parse(data), knots=21)
+
+
+def changed(data, number, **keys):
+    """The plan with other keys of one phase; None removes a key."""
+    other = copy.deepcopy(data)
+    row = other["phase"][number] | keys
+    other["phase"][number] = {key: value for key, value in row.items() if value is not None}
+    return other
+
+
+def independent_margin(scene, z, names, held_fingers):
+    """The largest least force of a hold: forces and torques by hand from points and normals of the polygon."""
+    vertices = np.asarray(scene.object.vertices)[: int(scene.object.count)]
+    after = np.roll(vertices, -1, axis=0)
+    cross = vertices[:, 0] * after[:, 1] - vertices[:, 1] * after[:, 0]
+    centroid = (cross[:, None] * (vertices + after)).sum(0) / (3 * cross.sum())
+    c, s = np.cos(z[2]), np.sin(z[2])
+    corners = (vertices - centroid) @ np.array([[c, s], [-s, c]]) + z[:2]
+    joints = np.asarray(scene.hand.joint)
+    # Unknowns: c_n, c_t of each contact, torque and dry friction of each finger that takes part, the margin.
+    n, f = len(names), len(held_fingers)
+    size = 2 * n + 2 * f + 1
+    balance, cone = np.zeros((3 + f, size)), []
+    for k, name in enumerate(names):
+        link, feature = name.split(":")
+        point, finger = corners[int(feature[1:])], None if link == "palm" else int(link[-1])
+        along = np.array([1.0, 0.0]) if finger is None else np.array([np.cos(z[2 + finger]), np.sin(z[2 + finger])])
+        normal = np.array([-along[1], along[0]]) * (-1.0 if finger == 2 else 1.0)
+        mu = float(scene.object.friction[0 if finger is None else finger])
+        for column, force in ((k, normal), (n + k, np.array([normal[1], -normal[0]]))):
+            arm = point - z[:2]
+            balance[:3, column] = *force, arm[0] * force[1] - arm[1] * force[0]
+            if finger in held_fingers:
+                arm = point - joints[finger - 1]
+                balance[3 + held_fingers.index(finger), column] = -(arm[0] * force[1] - arm[1] * force[0])
+        for sign in (1.0, -1.0):
+            row = np.zeros(size)
+            row[k], row[n + k] = -mu, sign
+            cone.append(row)
+        row = np.zeros(size)
+        row[k], row[-1] = -1.0, 1.0
+        cone.append(row)
+    for k in range(f):
+        balance[3 + k, [2 * n + k, 2 * n + f + k]] = 1.0
+    load = np.array([0.0, float(scene.object.mass) * 9.81, 0.0, *np.zeros(f)])
+    limits = [float(scene.hand.torque_limit[i - 1]) for i in held_fingers]
+    dry = [float(scene.hand.dry[i - 1]) for i in held_fingers]
+    bounds = [(None, None)] * (2 * n) + [(-x, x) for x in (*limits, *dry)] + [(None, None)]
+    found = linprog(
+        [*np.zeros(size - 1), -1.0], np.array(cone), np.zeros(len(cone)), balance, load, bounds, method="highs"
+    )
+    assert found.success
+    return found.x[-1]
+
+
+@pytest.mark.parametrize(
+    ("names", "moving"),
+    [
+        (["palm:v3", "palm:v4", "finger2:v2"], 1),
+        (["palm:v3", "palm:v4", "finger1:v6"], 2),
+        (["palm:v3", "palm:v4"], 1),
+        (["palm:v3", "palm:v4", "finger2:v2", "finger2:v1"], 1),
+    ],
+)
+def test_the_margin_of_a_hold_without_a_finger_is_that_of_a_programme_of_its_own(data, optimum, names, moving):
+    scene = wa.parse(data)
+    # Both fingers' vertices touch: of the last formation where the push ends, of the others at the start.
+    z = np.asarray(optimum.result.phases[1 if "finger2:v1" in names else 0].traced.end)
+    z = np.asarray(optimum.result.phases[0].traced.begin) if "finger1:v6" in names else z
+    ours = without_joint(contact_statics(scene, contact_formation(names), z), moving).best().margin
+    fingers = sorted({int(name[6]) for name in names if name.startswith("finger")})
+    assert ours == pytest.approx(independent_margin(scene, z, names, fingers), abs=1e-9)
+
+
+def test_one_finger_at_a_time_moves(optimum):
+    opens, pushes, closes = optimum.result.phases
+    assert optimum.result.status is wa.Status.OK
+    for phase, moving in ((opens, [3]), (closes, [3]), (pushes, [0, 4])):
+        change = np.abs(np.asarray(phase.traced.end - phase.traced.begin))
+        assert np.flatnonzero(change > 1e-9).tolist() == moving
+    assert describe_end(optimum.scene, optimum.scene.phases[2], closes.traced) == "finger1:v6 is made"
+    assert closes.traced.end[0] > opens.traced.begin[0] + 0.01
+
+
+def test_the_finger_that_is_away_needs_no_torque(optimum):
+    times, values = np.asarray(optimum.torque.times), np.asarray(optimum.torque.values)
+    inside = (times > 0.5) & (times < 1.5)
+    assert np.all(values[inside, 0] == 0)
+    assert np.abs(values[inside, 1]).max() > 0
+
+
+def test_the_push_obeys_newton(optimum):
+    """Without finger 1 the object's acceleration is that of finger 2's force less the palm's friction."""
+    motion = wa.trajectory(optimum.result, 401)[1]
+    mass, mu = float(optimum.scene.object.mass), float(optimum.scene.object.friction[0])
+    normal = np.sin(motion.z[:, 4])  # the x part of finger 2's normal, its slip's friction by the tangent
+    push = motion.cn[:, 2] * normal + motion.ct[:, 2] * -np.cos(motion.z[:, 4])
+    acceleration = np.gradient(motion.z_dot[:, 0], motion.time)
+    moving = motion.z_dot[:, 0] > 0.2 * motion.z_dot[:, 0].max()
+    expected = (push - mu * (motion.cn[:, 0] + motion.cn[:, 1])) / mass
+    scale = np.abs(acceleration).max()
+    np.testing.assert_allclose(acceleration[moving][1:-1], expected[moving][1:-1], atol=2e-2 * scale)
+    assert np.isnan(motion.cn[:, 3]).all()
+
+
+def test_a_hold_reports_its_statics(optimum):
+    opens = optimum.result.phases[0]
+    (held,) = opens.holds
+    assert (held.start, held.end) == (0.0, 0.5)
+    assert held.margin >= opens.margin > 0  # forces along the path are some of those that friction can give
+
+
+def test_the_plan_is_executed_by_free_bodies(optimum):
+    done = execute(optimum.result)
+    assert done.ending is ExecutionOutcome.OK, done.message
+    assert done.position_error < 5e-5
+    assert not done.link_contacts
+
+
+def test_files_keep_regrasps(data, tmp_path):
+    scene = wa.parse(data)
+    wa.save(scene, tmp_path / "regrasp.toml")
+    again = wa.load(tmp_path / "regrasp.toml")
+    assert [phase.regrasp for phase in again.phases] == ["finger1:away", None, "finger1:v6"]
+    assert to_dict(again) == to_dict(scene)
+    assert again.phases[1].formation.away == ("finger1:away",)
+    assert load_start(tmp_path / "regrasp.toml").phases[0].formation.names == ("palm:v3 rolling", "palm:v4", "finger2:v2")
+
+
+def test_a_finger_that_misses_its_contact_is_named(data, optimum):
+    wrong = wa.simulate(wa.parse(changed(data, 2, regrasp="finger1:v5")), optimum.torque)
+    assert wrong.status is wa.Status.OBSTACLE
+    assert "finger1:v6 is made before finger1:v5" in wrong.message
+
+
+def test_a_finger_in_the_way_is_named(data, optimum):
+    low = copy.deepcopy(data)
+    low["hand"]["finger1"]["range"] = [1.2, np.pi]
+    blocked = wa.simulate(wa.parse(low), optimum.torque)
+    assert blocked.status is wa.Status.OBSTACLE
+    assert "finger1 reaches its range at 68.75 deg" in blocked.message
+
+
+def test_torque_that_turns_the_finger_that_is_away_is_refused(data, optimum):
+    values = np.asarray(optimum.torque.values).copy()
+    values[(np.asarray(optimum.torque.times) > 0.6) & (np.asarray(optimum.torque.times) < 0.8), 0] = 0.02
+    pushed = wa.simulate(wa.parse(data), wa.torque_schedule(optimum.torque.times, values))
+    assert pushed.phases[1].status is wa.Status.LEFT_FORMATION
+    assert "finger1 does not stay away: its torque of 0.02 N m exceeds 0.01 N m" in pushed.phases[1].message
+
+
+@pytest.mark.parametrize(
+    ("number", "keys", "message"),
+    [
+        (0, {"regrasp": "palm:v3"}, "phase[0].regrasp: 'palm:v3': a regrasp moves a finger"),
+        (2, {"regrasp": "finger1:v9"}, "phase[2].regrasp: 'finger1:v9': the object has vertices 0 to 6"),
+        (0, {"regrasp": "finger2:away"}, "phase[0].contacts: finger2 moves; name the contacts"),
+        (0, {"until": None}, "phase[0].until: missing; say how far the finger opens: until = { theta1 = ... }"),
+        (0, {"toward": "x+"}, "phase[0].toward: finger1:away moves theta1 alone; leave it out"),
+        (0, {"hold": True}, "phase[0].hold: a finger moves in a regrasp; leave it out"),
+        (2, {"until": {"theta1": 1.0}}, "phase[2].until: the finger moves until it makes finger1:v6; leave it out"),
+        (0, {"arrive": "moving"}, "phase[1].contacts: finger1:away must be at rest; phase 'open' arrives moving"),
+        (1, {"contacts": ["palm:v3", "palm:v4", "finger1:v6", "finger1:away"]}, "phase[1].contacts: a finger that is"),
+        (0, {"contacts": ["palm:v3"]}, "phase[0].contacts: 3 constraints; a hold needs exactly 4"),
+    ],
+)
+def test_wrong_phases_are_refused_in_one_line(data, number, keys, message):
+    with pytest.raises(SceneError, match="^scene: ") as refusal:
+        wa.parse(changed(data, number, **keys))
+    assert message in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_limited_rates_are_refused(data):
+    with pytest.raises(ValueError, match="in phase 'push' a finger is away"):
+        wa.optimise(wa.parse(data), rate_limit=10.0)
+
+
+def test_the_path_can_be_differentiated(data):
+    """Where the push ends depends on an offset of finger 2: forward and reverse mode against a difference."""
+    push = wa.parse(data | {"phase": data["phase"][1:2], "start": data["start"] | {"theta1": 0.9}})
+
+    @jax.jit
+    def end(length):
+        scene = eqx.tree_at(lambda s: s.hand.joint, push, push.hand.joint.at[1, 0].set(length))
+        return wa.trace(scene)[0].end[0]
+
+    joint, step = float(push.hand.joint[1, 0]), 1e-6
+    difference = (float(end(joint + step)) - float(end(joint - step))) / (2 * step)
+    assert float(jax.jit(jax.grad(end))(joint)) == pytest.approx(difference, rel=1e-6)
+    assert float(jax.jit(jax.jacfwd(end))(joint)) == pytest.approx(difference, rel=1e-6)
+    assert abs(difference) > 0.1
