@@ -169,7 +169,11 @@ def test_files_keep_regrasps(data, tmp_path):
     assert [phase.regrasp for phase in again.phases] == ["finger1:away", None, "finger1:v6"]
     assert to_dict(again) == to_dict(scene)
     assert again.phases[1].formation.away == ("finger1:away",)
-    assert load_start(tmp_path / "regrasp.toml").phases[0].formation.names == ("palm:v3 rolling", "palm:v4", "finger2:v2")
+    assert load_start(tmp_path / "regrasp.toml").phases[0].formation.names == (
+        "palm:v3 rolling",
+        "palm:v4",
+        "finger2:v2",
+    )
 
 
 def test_a_finger_that_misses_its_contact_is_named(data, optimum):
@@ -210,7 +214,7 @@ def test_torque_that_turns_the_finger_that_is_away_is_refused(data, optimum):
     ],
 )
 def test_wrong_phases_are_refused_in_one_line(data, number, keys, message):
-    with pytest.raises(SceneError, match="^scene: ") as refusal:
+    with pytest.raises(SceneError, match=r"^scene: ") as refusal:
         wa.parse(changed(data, number, **keys))
     assert message in str(refusal.value)
     assert "\n" not in str(refusal.value)

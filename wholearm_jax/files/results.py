@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from wholearm_jax.core import write_atomically
-from wholearm_jax.files.scene_schema import CONSTRAINTS
 from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.files.torque_csv import TORQUE_COLUMNS
-from wholearm_jax.model import COORDINATES, TorqueSchedule
+from wholearm_jax.model import CONSTRAINTS, COORDINATES, TorqueSchedule
 from wholearm_jax.phases import Result, trajectory
 
 _CONTACTS = range(1, CONSTRAINTS + 1)

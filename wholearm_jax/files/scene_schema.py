@@ -21,9 +21,16 @@ from pydantic import (
 )
 
 from wholearm_jax.files.angles import Angle, read_angles_by_coordinate
-from wholearm_jax.model import AWAY, COORDINATES, find_defect, hold_contacts, parse_contact, regrasp_finger
+from wholearm_jax.model import (
+    AWAY,
+    CONSTRAINTS,
+    COORDINATES,
+    find_defect,
+    hold_contacts,
+    parse_contact,
+    regrasp_finger,
+)
 
-CONSTRAINTS = 4
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]

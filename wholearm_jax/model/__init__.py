@@ -27,7 +27,7 @@ from wholearm_jax.model.kinematics import (
 from wholearm_jax.model.law_tables import LawTables, PhaseTables
 from wholearm_jax.model.mechanics import ScaledMechanics, configuration_unit, scaled_mechanics
 from wholearm_jax.model.outline import find_defect, remains_simple
-from wholearm_jax.model.regrasp import hold_contacts, regrasp_finger, regrasp_toward
+from wholearm_jax.model.regrasp import CONSTRAINTS, hold_contacts, regrasp_finger, regrasp_toward
 from wholearm_jax.model.resting import edge_on_palm, resting_angle, resting_configuration
 from wholearm_jax.model.scene import (
     ANGLE_COORDINATES,

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 from wholearm_jax.model.scene import AWAY, LINKS, parse_contact
 
-CONSTRAINTS = 4
-_CLOSING = {1: "+", 2: "-"}  # the sign in which each joint angle closes its finger on the object
-_OPENING = {1: "-", 2: "+"}
+CONSTRAINTS = 4  # of a path: the configuration has five coordinates
+_CLOSING_SIGN = {1: "+", 2: "-"}  # the sign in which each joint angle closes its finger on the object
+_OPENING_SIGN = {1: "-", 2: "+"}
 
 
 def regrasp_finger(regrasp: str) -> int:
@@ -30,7 +30,7 @@ def regrasp_finger(regrasp: str) -> int:
 def regrasp_toward(regrasp: str) -> str:
     """Return the way in which the finger turns: it closes to make a contact, and opens to be away."""
     finger = regrasp_finger(regrasp)
-    sign = (_OPENING if parse_contact(regrasp)[1] == AWAY else _CLOSING)[finger]
+    sign = (_OPENING_SIGN if parse_contact(regrasp)[1] == AWAY else _CLOSING_SIGN)[finger]
     return f"theta{finger}{sign}"
 
 

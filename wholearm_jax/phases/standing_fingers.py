@@ -16,7 +16,7 @@ from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.tracing import PathEnd
 
 IDLE_ROUNDING = 1e-9  # share of the torque limit by which an idle torque may exceed dry friction
-STAYS = 1e-6  # [m] and [rad], within which the object stays where it is
+STANDING_TOL = 1e-6  # [m] and [rad], within which the object stays where it is
 
 
 class Defect(NamedTuple):
@@ -58,7 +58,7 @@ def _find_path_defect(scene: Scene, phase: Phase, traced: TracedPhase) -> tuple[
         return None
     moved = np.abs(np.asarray(traced.end) - np.asarray(traced.begin))
     moved[2 + regrasp_finger(phase.regrasp)] = 0.0
-    if moved.max() > STAYS:
+    if moved.max() > STANDING_TOL:
         return Status.LEFT_FORMATION, f"{' '.join(phase.formation.names)} do not hold the object while the finger moves"
     end = describe_end(scene, phase, traced)
     if bool(traced.dynamics.ends_at_obstacle):

@@ -13,7 +13,7 @@ from wholearm_jax.planning.moves import Move
 from wholearm_jax.planning.plans import Step
 from wholearm_jax.tracing import PathEnd
 
-STAYS = 1e-9  # [m] and [rad], within which the object and the other finger stay where they are
+STAYS_TOL = 1e-9  # [m] and [rad], within which the object and the other finger stay where they are
 OPENINGS = (0.3, 0.6, 0.95)  # fractions of the way to what stops a finger, at which it may stand away
 
 
@@ -31,7 +31,7 @@ def separate_regrasps(moves: Sequence[Move]) -> tuple[tuple[Move, ...], tuple[Mo
 
 def moving_finger(move: Move) -> int | None:
     """Return the finger that moves alone along a path; None where the object moves, or both fingers do."""
-    moves = np.abs(move.places - move.places[0]).max(0) > STAYS
+    moves = np.abs(move.places - move.places[0]).max(0) > STAYS_TOL
     alone = np.flatnonzero(moves)
     return int(alone[0]) - 2 if len(alone) == 1 and alone[0] >= 3 else None
 
