@@ -233,7 +233,9 @@ def _expand(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching) -
     for move, (step, is_end) in stops:
         if step.margin > search.floor:
             search.graph.append(Edge(z, step.end, step.margin))
-            _push(search, step.end, (*steps, step), None if is_end else _names(move))
+            # Along the path of a finger alone, more may touch than what holds the object.
+            seen = None if is_end or step.regrasp else _names(move)
+            _push(search, step.end, (*steps, step), seen)
 
 
 def _names(move: Move) -> tuple[str, ...]:
