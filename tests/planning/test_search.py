@@ -77,6 +77,19 @@ def test_moves_are_the_formations_that_can_follow(part):
         np.testing.assert_allclose(end, listed[key], atol=1e-8)
 
 
+def test_a_finger_moves_alone_only_where_regrasps_are_allowed():
+    """Finger 1 is to stand away while all else stays where it is: no path of four sliding contacts leads there."""
+    scene = wa.load("heptagon")
+    begin = wa.trace(scene)[0].begin
+    scene = eqx.tree_at(lambda s: (s.start, s.phases), scene, (begin, ()))
+    wanted = {"goal": {"theta1": 0.9}, "by": {"x": 0.0, "phi": 0.0, "theta2": 0.0}}
+    assert not wa.plan(scene, **wanted, max_phases=2, rolling=False).found
+    found = wa.plan(scene, **wanted, max_phases=2, regrasp_cost=0.5, count=1)
+    assert [step.regrasp for step in found.plans[0].steps] == ["finger1:away"]
+    assert found.plans[0].bound > 0
+    assert wa.optimise(found.plans[0].scene, knots=11).result.status is wa.Status.OK
+
+
 def test_an_unreachable_goal_names_the_nearest_pose(part):
     found = wa.plan(part, by={"x": 0.5}, max_phases=1)
     assert not found.found

@@ -4,7 +4,7 @@ A finger opens to stand away from the object, at one of a few places, or closes 
 object that differ in which contacts stick lead along the same path: the one with the largest margin stands for all.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -36,13 +36,16 @@ def moving_finger(move: Move) -> int | None:
     return int(alone[0]) - 2 if len(alone) == 1 and alone[0] >= 3 else None
 
 
-def regrasp_stops(move: Move, capacity: int, last: str | None) -> Iterator[tuple[Step, bool]]:
+def regrasp_stops(
+    move: Move, capacity: int, last: str | None, goal: Mapping[str, float]
+) -> Iterator[tuple[Step, bool]]:
     """Yield the places at which a finger that moves alone may stop: a contact, or a few places away from the object.
 
     Args:
         move: the move.
         capacity: rows of the object's vertices.
         last: the regrasp of the step before, if it was one: the same finger does not move alone again.
+        goal: coordinates that the goal asks for; a finger may also stop where its angle has that value.
     """
     finger = moving_finger(move)
     if finger is None or (last is not None and last.startswith(LINKS[finger])):
@@ -56,7 +59,10 @@ def regrasp_stops(move: Move, capacity: int, last: str | None) -> Iterator[tuple
             yield Step(move.contacts, move.toward, None, move.places[end], float(lowest[end]), regrasp), True
     away = f"{LINKS[finger]}:away"
     if move.toward == regrasp_toward(away):
-        for fraction in OPENINGS:
-            z = move.places[0] + fraction * (move.places[end] - move.places[0])
-            until = COORDINATES[2 + finger], float(z[2 + finger])
-            yield Step(move.contacts, move.toward, until, z, float(lowest[end]), away), False
+        joint, row = COORDINATES[2 + finger], 2 + finger
+        begin, turn = move.places[0], move.places[end] - move.places[0]
+        fractions = [*OPENINGS, *([(goal[joint] - begin[row]) / turn[row]] if joint in goal else [])]
+        for fraction in fractions:
+            if 0 < fraction < 1:
+                z = begin + fraction * turn
+                yield Step(move.contacts, move.toward, (joint, float(z[row])), z, float(lowest[end]), away), False

@@ -229,7 +229,7 @@ def _expand(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching) -
     stops = [(move, stop) for move in others if move.contacts != previous for stop in _stops(search, move)]
     last = steps[-1].regrasp if steps else None
     capacity = search.scene.object.vertices.shape[0]
-    stops += [(move, stop) for move in alone for stop in regrasp_stops(move, capacity, last)]
+    stops += [(move, stop) for move in alone for stop in regrasp_stops(move, capacity, last, search.goal.values)]
     for move, (step, is_end) in stops:
         if step.margin > search.floor:
             search.graph.append(Edge(z, step.end, step.margin))
