@@ -114,6 +114,7 @@ def test_mirror_image(original):
     assert_same(outcome(data, mirrored), expected)
 
 
+@pytest.mark.filterwarnings("ignore:.*lengths in a scene are metres")
 @pytest.mark.parametrize("units", [(1e3, 1.0, 1.0), (1.0, 1e3, 1.0), (1.0, 1.0, 10.0), (0.37, 11.0, 2.3)])
 def test_units(original, units):
     """All numbers of the scene in other units of length, mass and time."""
