@@ -98,6 +98,7 @@ def test_killed_at_any_moment_it_goes_on_to_the_same_store(command, whole, tmp_p
     assert contents(path) == whole
 
 
+@pytest.mark.slow
 def test_two_devices_find_what_one_does(command, whole, tmp_path):
     """Another program, that rounds differently: but for the last digits."""
     path = tmp_path / "two.zarr"
@@ -108,7 +109,7 @@ def test_two_devices_find_what_one_does(command, whole, tmp_path):
         np.testing.assert_allclose(*both, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("number", [2, 4])
+@pytest.mark.parametrize("number", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_several_processes_leave_what_one_does(command, whole, tmp_path, number):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

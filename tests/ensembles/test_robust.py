@@ -110,6 +110,7 @@ def test_what_the_command_writes(slide, wholearm, tmp_path):
     assert "share that holds of unseen scenes" in (tmp_path / "out" / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_an_object_that_waits_where_nothing_holds_it_does_not_hold(slide):
     """Fingers that open gently do not move the object as far as accelerations tell, but nothing holds it either."""
     both = wa.read_torque(Path(__file__).parents[1] / "data" / "heptagon_torque.csv")

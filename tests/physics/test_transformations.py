@@ -114,14 +114,15 @@ GRADIENTS = {
 }
 FUNCTIONS = [margin_of_torque, margin_of_friction, bound_of_mass, quasistatic_of_mass, length_of_friction]
 LONG = (margin_of_torque, margin_of_friction, gradient_of_torque)
-QUICK = {"value_and_grad", "grad of scan"}  # of the gradients of whole margins, which take long to record
+QUICK = ("value_and_grad", "grad of scan")  # of the gradients of whole margins, which take long to record
 
 
 def gradient_cases():
     """Every function with every transformation; what takes longest and differs least from others is slow."""
     for function in FUNCTIONS:
         for name, transform in GRADIENTS.items():
-            is_slow = function in LONG and name not in QUICK
+            quick = QUICK if function is margin_of_friction else QUICK[:1]
+            is_slow = function in LONG and name not in quick
             marks = pytest.mark.slow if is_slow else ()
             yield pytest.param(function, transform, id=f"{function.__name__}-{name}", marks=marks)
 
@@ -130,7 +131,8 @@ def value_cases():
     """Every function with every transformation; of what takes long to record, those that differ least are slow."""
     for function in (*FUNCTIONS, gradient_of_torque):
         for name, transform in VALUES.items():
-            is_slow = function in LONG and name not in ("vmap", "scan")
+            quick = ("scan",) if function is gradient_of_torque else ("vmap", "scan")
+            is_slow = function in LONG and name not in quick
             marks = pytest.mark.slow if is_slow else ()
             yield pytest.param(function, transform, id=f"{function.__name__}-{name}", marks=marks)
 
