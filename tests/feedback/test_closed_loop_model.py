@@ -142,3 +142,17 @@ def test_a_check_needs_a_schedule_or_a_controller_for_its_plan(thin, scene):
         wa.check([scene])
     with pytest.raises(ValueError, match="another plan"):
         wa.check([other], controller=thin)
+
+
+def test_the_command_checks_a_controller(thin, scene, wholearm, tmp_path):
+    path = tmp_path / "controller.json"
+    wa.write_controller(thin, path)
+    wa.save(scene, tmp_path / "plan.toml")
+    options = ("--controller", path, "--vary", "friction=10%", "--count", "2")
+    code, out, err = wholearm("check", tmp_path / "plan.toml", *options, "--out", tmp_path / "closed.zarr")
+    assert code == 0, err
+    assert "2 of 2 hold" in out
+    assert "controller.json" in (tmp_path / "closed.json").read_text()
+    code, _, err = wholearm("check", "hexagon", *options, "--out", tmp_path / "other.zarr")
+    assert code == 2
+    assert "another plan" in err
