@@ -182,6 +182,15 @@ def test_a_finger_that_misses_its_contact_is_named(data, optimum):
     assert "finger1:v6 is made before finger1:v5" in wrong.message
 
 
+def test_a_start_that_puts_the_finger_within_the_object_by_rounding_is_told(data, optimum):
+    """As digits of single precision do."""
+    rounded = copy.deepcopy(data)
+    rounded["start"]["theta1"] += 4e-8
+    wrong = wa.simulate(wa.parse(rounded), optimum.torque)
+    assert wrong.phases[0].status is wa.Status.OBSTACLE
+    assert "finger1:v6 is made before the finger is away, which the start puts a little behind" in wrong.message
+
+
 def test_a_finger_in_the_way_is_named(data, optimum):
     low = copy.deepcopy(data)
     low["hand"]["finger1"]["range"] = [1.2, np.pi]

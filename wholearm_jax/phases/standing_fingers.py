@@ -17,6 +17,8 @@ from wholearm_jax.tracing import PathEnd
 
 IDLE_ROUNDING = 1e-9  # share of the torque limit by which an idle torque may exceed dry friction
 STANDING_TOL = 1e-6  # [m] and [rad], within which the object stays where it is
+NO_TURN = 1e-5  # [rad], below which a finger has only left an overlap with what it touched
+BEHIND = ", which the start puts a little behind the finger: open it by as much, or begin with a phase that touches it"
 
 
 class Defect(NamedTuple):
@@ -63,9 +65,12 @@ def _find_path_defect(scene: Scene, phase: Phase, traced: TracedPhase) -> tuple[
     end = describe_end(scene, phase, traced)
     if bool(traced.dynamics.ends_at_obstacle):
         return Status.OBSTACLE, end
-    if phase.regrasp.endswith(":away"):
-        return None
     made = int(traced.path.end_reason) == PathEnd.CONTACT_MADE
+    if made and phase.regrasp.endswith(":away"):
+        turn = abs(
+            float(traced.end[2 + regrasp_finger(phase.regrasp)] - traced.begin[2 + regrasp_finger(phase.regrasp)])
+        )
+        return Status.OBSTACLE, f"{end} before the finger is away{BEHIND if turn < NO_TURN else ''}"
     if made and end != f"{phase.regrasp} is made":
         return Status.OBSTACLE, f"{end} before {phase.regrasp}"
     return None
