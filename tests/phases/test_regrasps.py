@@ -10,6 +10,7 @@ from scipy.optimize import linprog
 
 import wholearm_jax as wa
 from wholearm_jax.core import SceneError
+from wholearm_jax.ensembles import make_ensemble
 from wholearm_jax.execution.executions import ExecutionOutcome, execute
 from wholearm_jax.files import load_start
 from wholearm_jax.files.scene_toml import to_dict
@@ -205,6 +206,16 @@ def test_torque_that_turns_the_finger_that_is_away_is_refused(data, optimum):
     pushed = wa.simulate(wa.parse(data), wa.torque_schedule(optimum.torque.times, values))
     assert pushed.phases[1].status is wa.Status.LEFT_FORMATION
     assert "finger1 does not stay away: its torque of 0.02 N m exceeds 0.01 N m" in pushed.phases[1].message
+    assert wa.check([pushed.scene], pushed.torque).status.tolist() == [wa.Status.LEFT_FORMATION]
+
+
+def test_batches_judge_what_a_finger_makes_as_simulations_do(data, optimum):
+    """Stacked scenes keep their regrasps, and an ensemble's draws are judged alone."""
+    scene = wa.parse(changed(data, 2, regrasp="finger1:v5"))
+    heavier = eqx.tree_at(lambda s: s.object.mass, scene, 1.01 * scene.object.mass)
+    drawn = make_ensemble(wa.parse(data), {"mass": "1%"}, seed=1)
+    for scenes, count, expected in (([scene, heavier], None, wa.Status.OBSTACLE), (drawn, 2, wa.Status.OK)):
+        assert wa.check(scenes, optimum.torque, count=count, arrival=0.02).status.tolist() == [expected] * 2
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,13 @@ def _check_chunk(
     passes: tuple[Fidelity, ...],
     mesh,
 ) -> BatchResult:
-    """Check the scenes `numbers` pass by pass, and simulate alone those that no pass settles."""
+    """Check the scenes `numbers` pass by pass, and simulate alone those that no pass settles.
+
+    Fingers that stand away or move alone are judged by a simulation alone, so none of their scenes has a pass.
+    """
+    if any(phase.regrasp or phase.formation.is_away is not None for phase in source.nominal.phases):
+        alone = [from_result(_simulate_alone(source.draw(number), torque, float(arrival))) for number in numbers]
+        return BatchResult(*(np.stack(column) for column in zip(*alone, strict=True)))
     schedule = torque if isinstance(torque, LawTables) else pad_schedule(torque)
     results, rows, single = None, np.arange(len(numbers)), []
     for fidelity in passes:

@@ -1,6 +1,7 @@
 """Sources of scenes for a check: scenes stacked along a leading axis, and the interface shared with ensembles."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
@@ -65,7 +66,7 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
     """Stack scenes along a leading axis of every array; polygons are padded to the largest.
 
     Names and titles are the first scene's. Raises ValueError for no scenes, and for scenes that differ in their number
-    of phases, in how a phase arrives, or in whether inertia and centre of mass are given.
+    of phases, in how a phase arrives or regrasps, or in whether inertia and centre of mass are given.
     """
     if not scenes:
         raise ValueError("there are no scenes to stack")
@@ -88,5 +89,4 @@ def _with_names_of(scene: Scene, other: Scene) -> Scene:
     if len(scene.phases) != len(other.phases):
         return scene
     pairs = zip(scene.phases, other.phases, strict=True)
-    phases = tuple(type(p)(q.name, p.formation, p.target, p.duration, p.arrive) for p, q in pairs)
-    return Scene(other.title, scene.gravity, scene.hand, scene.object, scene.start, phases)
+    return replace(scene, title=other.title, phases=tuple(replace(p, name=q.name) for p, q in pairs))

@@ -10,7 +10,7 @@ Derivation: section 10 of `docs/derivation.md`.
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -106,8 +106,7 @@ def precompile_search() -> BackgroundTask:
 
 
 def _with_any_speed(phase: Phase) -> Phase:
-    ends = {"arrive": Arrival.ANY_SPEED, "regrasp": phase.regrasp}
-    return Phase(phase.name, phase.formation, phase.target, phase.duration, **ends)
+    return replace(phase, arrive=Arrival.ANY_SPEED)
 
 
 def _search_phase(path: TracedPhase, longest: float) -> tuple[np.ndarray, float, int]:
