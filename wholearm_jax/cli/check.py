@@ -23,7 +23,7 @@ from wholearm_jax.cli.arguments import (
     parse_ensemble,
     refuse_unwritable,
 )
-from wholearm_jax.cli.prediction import note_doubtful_schedule, refuse_short
+from wholearm_jax.cli.prediction import note_doubtful_schedule, read_controller_of, refuse_short
 from wholearm_jax.cli.processes import ProcessRank, join_processes, use_all_processors
 from wholearm_jax.cli.progress import count_progress
 from wholearm_jax.core import configure
@@ -107,15 +107,9 @@ def _read_actuation(scene, torque: Path | None, controller: Path | None, rank: P
     if torque is not None:
         return _read_schedule(scene, torque, rank)
     assert controller is not None
-    from wholearm_jax.feedback import law_tables, require_same_plan
-    from wholearm_jax.files import read_controller
+    from wholearm_jax.feedback import law_tables
 
-    law = read_controller(controller)
-    try:
-        require_same_plan(law, scene)
-    except ValueError as error:
-        raise BadInput(f"{controller}: {error}") from None
-    return law_tables(law)
+    return law_tables(read_controller_of(scene, controller))
 
 
 def _read_schedule(scene, torque: Path, rank: ProcessRank):

@@ -17,7 +17,7 @@ from wholearm_jax.cli.arguments import (
 )
 from wholearm_jax.cli.interruption import quieten_workers
 from wholearm_jax.cli.output import may_replace
-from wholearm_jax.cli.prediction import simulate_or_exit, trace_or_exit
+from wholearm_jax.cli.prediction import read_controller_of, simulate_or_exit, trace_or_exit
 from wholearm_jax.cli.progress import count_progress
 from wholearm_jax.cli.tables import print_json
 
@@ -103,18 +103,13 @@ def _predict(name: str, scene, torque: Path | None, controller: Path | None):
 
     That of a controller is the plan under the quasi-static torques: where the paths begin and end is the same for all.
     """
-    from wholearm_jax.feedback import require_same_plan
-    from wholearm_jax.files import read_controller, read_torque
+    from wholearm_jax.files import read_torque
     from wholearm_jax.optimisation import quasistatic
 
     if torque is not None:
         return simulate_or_exit(scene, read_torque(torque), torque, 1e-10, trace_or_exit(name, scene)), None
     assert controller is not None
-    law = read_controller(controller)
-    try:
-        require_same_plan(law, scene)
-    except ValueError as error:
-        raise BadInput(f"{controller}: {error}") from None
+    law = read_controller_of(scene, controller)
     traced = trace_or_exit(name, scene)
     return simulate_or_exit(scene, quasistatic(scene, traced=traced), controller, 1e-10, traced), law
 

@@ -78,6 +78,19 @@ def _note_unreached(name: str, scene, traced) -> None:
             note(f"{name}: phase[{k}].until: {until} is not on its path, which leads from {begin:.6g} to {end:.6g}")
 
 
+def read_controller_of(scene, controller: Path):
+    """Read a controller. Raises `BadInput` where it is one of another plan."""
+    from wholearm_jax.feedback import require_same_plan
+    from wholearm_jax.files import read_controller
+
+    law = read_controller(controller)
+    try:
+        require_same_plan(law, scene)
+    except ValueError as error:
+        raise BadInput(f"{controller}: {error}") from None
+    return law
+
+
 def refuse_short(scene, schedule, torque: Path) -> None:
     """Raise `BadInput` for a schedule of file `torque` that is shorter than its plan, before anything is computed."""
     from wholearm_jax.phases import require_covered

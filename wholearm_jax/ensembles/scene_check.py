@@ -102,39 +102,30 @@ def check_on_paths(
     scene: Scene, paths: ContactPath, schedule: TorqueSchedule | LawTables, arrival, fidelity: Fidelity
 ) -> tuple[BatchResult, Int[Array, ""]]:
     """Check one scene whose `paths`, stacked over its phases, are traced."""
-    if isinstance(schedule, LawTables):
-        return _check_in_closed_loop(scene, paths, schedule, arrival, fidelity)
-    body = rigid_body(scene.object)
-
-    def check_phase(carry, phase):
-        path, inputs, formation = phase
-        mechanics = scaled_mechanics(body, scene.hand, scene.gravity, formation)
-        dynamics = tabulate_path_dynamics(mechanics, path)
-        carry, simulated = scan_step(schedule, fidelity.options, arrival, carry, (dynamics, *inputs))
-        certified = certify_rest(mechanics, dynamics, schedule, simulated)
-        return carry, _summarise_phase(dynamics, simulated, formation, fidelity, certified)
-
-    formations = alike_formations([p.formation for p in scene.phases])
-    phases = stack_trees([(phase_inputs(p), one) for p, one in zip(scene.phases, formations, strict=True)])
-    _, checks = jax.lax.scan(check_phase, initial_carry(schedule), (paths, *phases))
-    return _combine_phases(checks, len(scene.phases))
-
-
-def _check_in_closed_loop(scene: Scene, paths: ContactPath, law: LawTables, arrival, fidelity: Fidelity):
-    """Check one scene under a closed-loop law."""
     body = rigid_body(scene.object)
 
     def check_phase(carry, phase):
         path, tables, inputs, formation = phase
         mechanics = scaled_mechanics(body, scene.hand, scene.gravity, formation)
         dynamics = tabulate_path_dynamics(mechanics, path)
-        loop = phase_loop(law, tables, dynamics)
-        carry, simulated = loop_step(law, fidelity.options, arrival, carry, (dynamics, loop, tables, *inputs))
-        certified = certify_rest(mechanics, dynamics, loop, simulated)
+        if isinstance(schedule, LawTables):
+            actuation = phase_loop(schedule, tables, dynamics)
+            carry, simulated = loop_step(
+                schedule, fidelity.options, arrival, carry, (dynamics, actuation, tables, *inputs)
+            )
+        else:
+            actuation = schedule
+            carry, simulated = scan_step(schedule, fidelity.options, arrival, carry, (dynamics, *inputs))
+        certified = certify_rest(mechanics, dynamics, actuation, simulated)
         return carry, _summarise_phase(dynamics, simulated, formation, fidelity, certified)
 
-    phases = stack_trees([(phase_inputs(p), p.formation) for p in scene.phases])
-    _, checks = jax.lax.scan(check_phase, initial_loop_carry(law), (paths, law.phases, *phases))
+    formations = alike_formations([p.formation for p in scene.phases])
+    phases = stack_trees([(phase_inputs(p), one) for p, one in zip(scene.phases, formations, strict=True)])
+    if isinstance(schedule, LawTables):
+        tables, carry = schedule.phases, initial_loop_carry(schedule)
+    else:
+        tables, carry = None, initial_carry(schedule)
+    _, checks = jax.lax.scan(check_phase, carry, (paths, tables, *phases))
     return _combine_phases(checks, len(scene.phases))
 
 

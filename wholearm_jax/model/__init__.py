@@ -32,6 +32,7 @@ from wholearm_jax.model.resting import edge_on_palm, resting_angle, resting_conf
 from wholearm_jax.model.scene import (
     ANGLE_COORDINATES,
     AWAY,
+    AWAY_NAMES,
     COORDINATES,
     EDGE,
     LINKS,

@@ -8,7 +8,7 @@ give: statics (`margin.statics`) may allow more.
 
 from collections.abc import Sequence
 
-from wholearm_jax.model.scene import AWAY, LINKS, parse_contact
+from wholearm_jax.model.scene import AWAY, AWAY_NAMES, LINKS, parse_contact
 
 CONSTRAINTS = 4  # of a path: the configuration has five coordinates
 _CLOSING_SIGN = {1: "+", 2: "-"}  # the sign in which each joint angle closes its finger on the object
@@ -49,7 +49,7 @@ def hold_contacts(contacts: Sequence[str], regrasp: str) -> tuple[str, ...]:
     links, other = [row[0] for row in rows], 3 - regrasp_finger(regrasp)
     if finger in links:
         raise ValueError(f"{LINKS[finger]} moves; name the contacts that hold the object without it")
-    contacts = [*contacts] if other in links else [*contacts, f"{LINKS[other]}:away"]
+    contacts = [*contacts] if other in links else [*contacts, AWAY_NAMES[other - 1]]
     free = CONSTRAINTS - len(contacts)
     if not any(row[3] for row in rows):
         touching = [text for text in contacts if parse_contact(text)[1] != AWAY]

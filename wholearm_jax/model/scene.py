@@ -25,7 +25,7 @@ FLUSH_TOLERANCE = 1e-6  # [m]
 VERTEX, EDGE = 0, 1  # contact types: A, an object vertex on a link; B, a fingertip on an object edge
 AWAY = 4  # no contact: a finger that touches nothing and stands still (2 and 3 are corners of links, `kinematics`)
 _CONTACT_PATTERN = re.compile(r"(palm|finger1|finger2):([ve])([0-9]+)( rolling)?")
-_AWAY_PATTERN = re.compile(r"(finger1|finger2):away")
+AWAY_NAMES = tuple(f"{finger}:away" for finger in LINKS[1:])
 
 
 class MassProperties(NamedTuple):
@@ -248,9 +248,8 @@ def parse_contact(text: str) -> tuple[int, int, int, bool]:
 
     Raises ValueError for anything else.
     """
-    parked = _AWAY_PATTERN.fullmatch(text.strip())
-    if parked is not None:
-        return LINKS.index(parked.group(1)), AWAY, 0, False
+    if text.strip() in AWAY_NAMES:
+        return 1 + AWAY_NAMES.index(text.strip()), AWAY, 0, False
     match = _CONTACT_PATTERN.fullmatch(text.strip())
     if match is None:
         raise ValueError(f"'{text}' is not a contact; write LINK:vN or LINK:eN, e.g. palm:v5 or finger2:e3")
@@ -268,7 +267,7 @@ def feature_pair(contact: str) -> str:
 def contact_name(link: int, kind: int, feature: int, *, rolling: bool = False) -> str:
     """The inverse of `parse_contact`."""
     if kind == AWAY:
-        return f"{LINKS[link]}:away"
+        return AWAY_NAMES[link - 1]
     return f"{LINKS[link]}:{'v' if kind == VERTEX else 'e'}{feature}" + (" rolling" if rolling else "")
 
 

@@ -100,13 +100,8 @@ def _next_carry(law: LawTables, tables: PhaseTables, duration, is_left_moving, s
         simulated.start + jnp.where(is_left_moving, ended, jnp.minimum(waited, duration)),
         passes * simulated.exit_velocity,
         passes * motion.memory[motion.count, 1],
-        _last_tangent(tables),
+        tables.tangent[-1],  # where the law's curve ends; rows that fill up repeat it
     )
-
-
-def _last_tangent(tables: PhaseTables) -> Float[Array, "2"]:
-    """Return the tangent where the law's curve ends; rows that fill up repeat it."""
-    return tables.tangent[-1]
 
 
 def simulate_closed_loop(

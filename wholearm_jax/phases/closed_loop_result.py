@@ -1,6 +1,7 @@
 """The simulation of a plan in closed loop as a `Result`, with the torques that the law has exerted as its schedule."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from wholearm_jax.core import Status, as_device_array, on_host, require_positive, require_x64
@@ -10,8 +11,9 @@ from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.phases.plan_schedule import require_motion
 from wholearm_jax.phases.plan_tracing import trace
+from wholearm_jax.phases.rest_certificate import torques_of_step
 from wholearm_jax.phases.result import Result, build_result
-from wholearm_jax.simulation import IntegratorOptions, PhaseLoop, phase_loop, torque_of
+from wholearm_jax.simulation import IntegratorOptions, Motion, PhaseLoop, phase_loop
 
 MAX_CLOSED_LOOP_STEPS = 16384  # a phase, beyond which nothing is tried again
 
@@ -46,7 +48,7 @@ def closed_loop_result(
     require_motion(scene)
     traced, steps = traced or trace(scene), CLOSED_LOOP_STEPS
     while True:
-        options = IntegratorOptions(tolerance=tolerance, max_steps=steps, max_stages=max(12, steps // 64))
+        options = IntegratorOptions(tolerance=tolerance, max_steps=steps, max_stages=steps // 64)
         phases = simulate_closed_loop(scene, law, traced, options, arrival)
         used_up = any(int(one.assessment.status) == Status.MAX_STEPS for one in phases)
         if not used_up or steps >= MAX_CLOSED_LOOP_STEPS:
@@ -72,9 +74,6 @@ def _exerted(law: LawTables, traced: tuple[TracedPhase, ...], phases: tuple[Simu
 
 
 @jax.jit
-def _step_torques(loop: PhaseLoop, motion):
+def _step_torques(loop: PhaseLoop, motion: Motion):
     """Evaluate the torque at both ends of every step: (steps, 2, 2)."""
-    each = jax.vmap(torque_of, (None, 0, 0, 0))
-    begin = each(loop, motion.row, motion.phase_time[:-1], motion.memory[:-1])
-    end = each(loop, motion.row, motion.phase_time[1:], motion.memory[1:])
-    return jax.numpy.stack([begin, end], axis=1)
+    return jax.vmap(torques_of_step, (None, None, 0))(loop, motion, jnp.arange(motion.row.shape[0]))

@@ -73,7 +73,7 @@ def _certify_interval(
         friction > 0, friction, 1.0
     )  # signs of slip, as traced
     torques = (
-        _loop_torques(actuation, motion, k)
+        torques_of_step(actuation, motion, k)
         if isinstance(actuation, PhaseLoop)
         else _rest_torques(actuation, begin, end)
     )
@@ -105,8 +105,8 @@ def _rest_torques(phase_schedule: PhaseSchedule, begin, end) -> Float[Array, "co
     return jnp.concatenate([ends, jnp.where(inside[:, None], phase_schedule.values, ends[0])])
 
 
-def _loop_torques(loop: PhaseLoop, motion: Motion, k) -> Float[Array, "corners 2"]:
-    """Return the torques of a closed loop where a rest, step `k` of a motion, begins and ends."""
+def torques_of_step(loop: PhaseLoop, motion: Motion, k) -> Float[Array, "corners 2"]:
+    """Return the torques of a closed loop where step `k` of a motion begins and ends."""
     assert motion.memory is not None
     nodes = jnp.stack([k, k + 1])
     row = take_row(motion.row, k)

@@ -10,7 +10,7 @@ import numpy as np
 
 from wholearm_jax.core import Status
 from wholearm_jax.margin import RestInterval, contact_statics, rest_margin, schedule_corners, without_joint
-from wholearm_jax.model import LINKS, Phase, Scene, TorqueSchedule, regrasp_finger
+from wholearm_jax.model import AWAY_NAMES, LINKS, Phase, Scene, TorqueSchedule, regrasp_finger
 from wholearm_jax.phases.phase_ends import describe_end
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.tracing import PathEnd
@@ -31,7 +31,7 @@ class Defect(NamedTuple):
 
 def idle_torques(phase: Phase, torques):
     """Return torques `(..., 2)` with zeros for the fingers that are away."""
-    idle = [LINKS.index(text.partition(":")[0]) - 1 for text in phase.formation.away]
+    idle = [AWAY_NAMES.index(name) for name in phase.formation.away]
     return np.where(np.isin([0, 1], idle), 0.0, torques) if idle else torques
 
 
@@ -42,8 +42,7 @@ def find_standing_defect(
     wrong = _find_path_defect(scene, phase, traced)
     if wrong is not None:
         return Defect(wrong[0], start, wrong[1])
-    for text in phase.formation.away:
-        joint = LINKS.index(text.partition(":")[0]) - 1
+    for joint in map(AWAY_NAMES.index, phase.formation.away):
         times, torques = schedule_corners(torque, start, start + duration)
         dry, limit = float(scene.hand.dry[joint]), float(scene.hand.torque_limit[joint])
         turned = np.flatnonzero(np.abs(np.array(torques)[:, joint]) > dry + IDLE_ROUNDING * limit)
@@ -59,18 +58,15 @@ def _find_path_defect(scene: Scene, phase: Phase, traced: TracedPhase) -> tuple[
     if phase.regrasp is None:
         return None
     moved = np.abs(np.asarray(traced.end) - np.asarray(traced.begin))
-    moved[2 + regrasp_finger(phase.regrasp)] = 0.0
-    if moved.max() > STANDING_TOL:
+    joint = 2 + regrasp_finger(phase.regrasp)
+    if np.delete(moved, joint).max() > STANDING_TOL:
         return Status.LEFT_FORMATION, f"{' '.join(phase.formation.names)} do not hold the object while the finger moves"
     end = describe_end(scene, phase, traced)
     if bool(traced.dynamics.ends_at_obstacle):
         return Status.OBSTACLE, end
     made = int(traced.path.end_reason) == PathEnd.CONTACT_MADE
-    if made and phase.regrasp.endswith(":away"):
-        turn = abs(
-            float(traced.end[2 + regrasp_finger(phase.regrasp)] - traced.begin[2 + regrasp_finger(phase.regrasp)])
-        )
-        return Status.OBSTACLE, f"{end} before the finger is away{BEHIND if turn < NO_TURN else ''}"
+    if made and phase.regrasp in AWAY_NAMES:
+        return Status.OBSTACLE, f"{end} before the finger is away{BEHIND if moved[joint] < NO_TURN else ''}"
     if made and end != f"{phase.regrasp} is made":
         return Status.OBSTACLE, f"{end} before {phase.regrasp}"
     return None

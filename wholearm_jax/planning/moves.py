@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 from wholearm_jax.core import CachedJit, Status
 from wholearm_jax.margin import best_quasistatic_torque
 from wholearm_jax.model import (
+    AWAY_NAMES,
     ContactFormation,
     Scene,
     alike_formations,
@@ -28,7 +29,6 @@ from wholearm_jax.tracing import Resolution
 
 MOVES_PER_CALL = 8  # paths that one call of the program traces; the last call is filled up
 PLACES = 33  # configurations of a path that are kept
-AWAY_NAMES = ("finger1:away", "finger2:away")
 RESOLUTION = Resolution(panels=16)  # of the planner's tables: forces to three digits
 
 
@@ -105,7 +105,7 @@ def _trace(scene: Scene, z, regrasps: bool, chosen) -> _Paths:
     chosen = [*chosen, *chosen[:1] * (MOVES_PER_CALL - len(chosen))]
     every = [_formation(contacts) for contacts, _ in chosen]
     if regrasps:  # one program, whether or not a finger is away in one of them
-        every = alike_formations([*every, _formation(("finger1:away",))])[:-1]
+        every = alike_formations([*every, _formation(AWAY_NAMES[:1])])[:-1]
     formations = jax.tree.map(lambda *rows: np.stack(rows), *every)
     targets = [path_target(toward) for _, toward in chosen]
     stacked = jax.tree.map(lambda *rows: np.stack(rows), *targets)

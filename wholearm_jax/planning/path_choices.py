@@ -10,11 +10,12 @@ from jaxtyping import Array, Float
 from wholearm_jax.core import CachedJit
 from wholearm_jax.margin import MAX_ROLLING
 from wholearm_jax.model import (
+    AWAY_NAMES,
     COORDINATES,
-    LINKS,
     Scene,
     constraint_jacobian,
     contact_formation,
+    feature_pair,
     rigid_body,
     scaled_mechanics,
 )
@@ -35,13 +36,11 @@ def formation_names(contacts: Sequence[str], rolling: bool) -> Iterator[tuple[st
 
 def _is_possible(names: Sequence[str]) -> bool:
     """Whether at most one finger is away, and that one has no contact and does not roll."""
-    away = [name for name in names if name.endswith(":away")]
-    finger = away[0].partition(":")[0] if away else None
-    return (
-        len(away) <= 1
-        and not any(name.endswith(":away rolling") for name in names)
-        and (finger is None or sum(name.startswith(finger) for name in names) == 1)
-    )
+    away = [name for name in names if feature_pair(name) in AWAY_NAMES]
+    if not away:
+        return True
+    finger = away[0].partition(":")[0]
+    return away[0] in AWAY_NAMES and away == [name for name in names if name.startswith(finger)]
 
 
 def path_choices(
@@ -76,7 +75,7 @@ def _path_directions(scene: Scene, z, contacts: Sequence[str], combinations) -> 
     every = contact_formation([f"{name} rolling" for name in padded])
     rows = np.asarray(_constraint_rows(rigid_body(scene.object), scene.hand, scene.gravity, every, jnp.asarray(z)))
     rows_of = {name: rows[2 * k : 2 * k + 2] for k, name in enumerate(contacts)}
-    rows_of |= {f"{finger}:away": np.eye(5)[2 + k : 3 + k] for k, finger in enumerate(LINKS) if k > 0}
+    rows_of |= {name: np.eye(5)[3 + k : 4 + k] for k, name in enumerate(AWAY_NAMES)}
     # A path's direction is the null vector of its four rows.
     stacked = np.stack([np.concatenate([_rows_held(rows_of, name) for name in names]) for names in combinations])
     _, values, right = np.linalg.svd(stacked)

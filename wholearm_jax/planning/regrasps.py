@@ -8,7 +8,16 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from wholearm_jax.model import COORDINATES, EDGE, FEATURE_GROUPS, LINKS, VERTEX, contact_name, regrasp_toward
+from wholearm_jax.model import (
+    AWAY_NAMES,
+    COORDINATES,
+    EDGE,
+    FEATURE_GROUPS,
+    LINKS,
+    VERTEX,
+    contact_name,
+    regrasp_toward,
+)
 from wholearm_jax.planning.moves import Move
 from wholearm_jax.planning.plans import Step
 from wholearm_jax.tracing import PathEnd
@@ -22,7 +31,8 @@ def separate_regrasps(moves: Sequence[Move]) -> tuple[tuple[Move, ...], tuple[Mo
     best: dict[str, Move] = {}
     others = []
     for move in moves:
-        if moving_finger(move) is None:
+        finger = moving_finger(move)
+        if finger is None:
             others.append(move)
         elif move.toward not in best or move.margins.min() > best[move.toward].margins.min():
             best[move.toward] = move
@@ -57,7 +67,7 @@ def regrasp_stops(
         if link == finger and kind in (VERTEX, EDGE):
             regrasp = contact_name(link, kind, feature)
             yield Step(move.contacts, move.toward, None, move.places[end], float(lowest[end]), regrasp), True
-    away = f"{LINKS[finger]}:away"
+    away = AWAY_NAMES[finger - 1]
     if move.toward == regrasp_toward(away):
         joint, row = COORDINATES[2 + finger], 2 + finger
         begin, turn = move.places[0], move.places[end] - move.places[0]

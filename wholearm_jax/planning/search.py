@@ -19,10 +19,10 @@ import equinox as eqx
 import numpy as np
 
 from wholearm_jax.core import as_device_array, require_x64
-from wholearm_jax.model import ANGLE_COORDINATES, COORDINATES, Scene, feature_pair, rigid_body
+from wholearm_jax.model import ANGLE_COORDINATES, AWAY_NAMES, COORDINATES, Scene, feature_pair, rigid_body
 from wholearm_jax.phases import trace
 from wholearm_jax.planning.goal import Goal, make_goal
-from wholearm_jax.planning.moves import AWAY_NAMES, Move, moves_from
+from wholearm_jax.planning.moves import Move, moves_from
 from wholearm_jax.planning.obstructions import explain_failure
 from wholearm_jax.planning.plans import Edge, Plan, PlanningResult, Step, make_plan
 from wholearm_jax.planning.regrasps import regrasp_stops, separate_regrasps
