@@ -10,7 +10,7 @@ from scipy.optimize import linprog
 
 import wholearm_jax as wa
 from wholearm_jax.core import SceneError
-from wholearm_jax.ensembles import make_ensemble
+from wholearm_jax.ensembles import make_ensemble, optimise_robustly
 from wholearm_jax.execution.executions import ExecutionOutcome, execute
 from wholearm_jax.files import load_start
 from wholearm_jax.files.scene_toml import to_dict
@@ -200,13 +200,27 @@ def test_a_finger_in_the_way_is_named(data, optimum):
     assert "finger1 reaches its range at 68.75 deg" in blocked.message
 
 
-def test_torque_that_turns_the_finger_that_is_away_is_refused(data, optimum):
+@pytest.fixture(scope="module")
+def pushing(optimum):
+    """The optimum, but for a torque on finger 1 while it is away that exceeds dry friction."""
     values = np.asarray(optimum.torque.values).copy()
     values[(np.asarray(optimum.torque.times) > 0.6) & (np.asarray(optimum.torque.times) < 0.8), 0] = 0.02
-    pushed = wa.simulate(wa.parse(data), wa.torque_schedule(optimum.torque.times, values))
+    return wa.torque_schedule(optimum.torque.times, values)
+
+
+def test_torque_that_turns_the_finger_that_is_away_is_refused(data, pushing):
+    pushed = wa.simulate(wa.parse(data), pushing)
     assert pushed.phases[1].status is wa.Status.LEFT_FORMATION
     assert "finger1 does not stay away: its torque of 0.02 N m exceeds 0.01 N m" in pushed.phases[1].message
     assert wa.check([pushed.scene], pushed.torque).status.tolist() == [wa.Status.LEFT_FORMATION]
+
+
+@pytest.mark.slow  # batches, which are judged by the same simulations, are checked below
+def test_robust_schedules_are_scored_by_what_simulations_say(data, optimum, pushing):
+    few = {"samples": 2, "steps": 1, "arrival": 0.02, "rate": 1e-9}
+    drawn = make_ensemble(wa.parse(data), {"mass": "1%"}, seed=1)
+    for torque, rate in ((optimum.torque, 1.0), (pushing, 0.0)):
+        assert optimise_robustly(drawn, nominal=torque, **few).in_sample[0].success_rate == rate
 
 
 def test_batches_judge_what_a_finger_makes_as_simulations_do(data, optimum):

@@ -24,7 +24,6 @@ from wholearm_jax.feedback import Controller, law_tables, require_same_plan
 from wholearm_jax.model import LawTables, Scene, TorqueSchedule, pad_schedule
 from wholearm_jax.phases import (
     CLOSED_LOOP_STEPS,
-    Result,
     closed_loop_options,
     closed_loop_result,
     has_torque_jumps,
@@ -134,10 +133,10 @@ def _check_chunk(
 ) -> BatchResult:
     """Check the scenes `numbers` pass by pass, and simulate alone those that no pass settles.
 
-    Fingers that stand away or move alone are judged by a simulation alone, so none of their scenes has a pass.
+    Plans with a free finger have no pass.
     """
-    if any(phase.regrasp or phase.formation.is_away is not None for phase in source.nominal.phases):
-        alone = [from_result(_simulate_alone(source.draw(number), torque, float(arrival))) for number in numbers]
+    if any(phase.has_free_finger for phase in source.nominal.phases):
+        alone = [_check_alone(source, number, torque, float(arrival)) for number in numbers]
         return BatchResult(*(np.stack(column) for column in zip(*alone, strict=True)))
     schedule = torque if isinstance(torque, LawTables) else pad_schedule(torque)
     results, rows, single = None, np.arange(len(numbers)), []
@@ -154,16 +153,18 @@ def _check_chunk(
             break
     assert results is not None
     for row in np.concatenate([*single, rows]):
-        result = _simulate_alone(source.draw(jnp.asarray(numbers[row])), torque, float(arrival))
-        _overwrite(results, row, from_result(result))
+        _overwrite(results, row, _check_alone(source, numbers[row], torque, float(arrival)))
     return results
 
 
-def _simulate_alone(scene: Scene, torque: TorqueSchedule | LawTables, arrival: float) -> Result:
-    """Simulate one scene, refined until all is fine."""
+def _check_alone(
+    source: Ensemble | SceneBatch, number, torque: TorqueSchedule | LawTables, arrival: float
+) -> BatchResult:
+    """Check one scene by its simulation, refined until all is fine."""
+    scene = source.draw(jnp.asarray(number))
     if isinstance(torque, LawTables):
-        return closed_loop_result(scene, torque, arrival=arrival)
-    return simulate(scene, torque, arrival=arrival)
+        return from_result(closed_loop_result(scene, torque, arrival=arrival))
+    return from_result(simulate(scene, torque, arrival=arrival))
 
 
 def _fidelity_for(nominal: Scene, torque: TorqueSchedule | LawTables, fidelity: Fidelity) -> Fidelity:

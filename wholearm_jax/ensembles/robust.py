@@ -65,8 +65,8 @@ def optimise_robustly(
 ) -> RobustSchedule:
     """Maximise the margin at a low quantile over the first scenes of an ensemble.
 
-    A sample that would hold, but whose object waits where nothing proves that friction can keep it there
-    (`rest_certificate`), is simulated by itself.
+    A sample that would hold is simulated by itself where a finger moves alone or stands away, and where the object
+    waits and nothing proves that friction can keep it there (`rest_certificate`).
 
     Args:
         ensemble: Scenes whose phases all move the object.
@@ -93,11 +93,12 @@ def optimise_robustly(
     in_sample, out_of_sample = (trace_samples(ensemble, jnp.arange(samples) + first) for first in (0, samples))
     options = with_plan_step_capacity(SAMPLE_OPTIONS, scene, start)
     options = replace(options, has_jumps=has_torque_jumps(scene, start))
+    has_free_finger = any(phase.has_free_finger for phase in scene.phases)
 
     def score(torque: TorqueSchedule, sampled: SampledScenes) -> tuple[SampledMargins, SampleScore]:
         result = margins_and_gradient(torque, sampled, jnp.asarray(arrival, float), options)
         holds = np.array(result.holds)
-        for k in np.flatnonzero(holds & ~np.asarray(result.rest_certified)):
+        for k in np.flatnonzero(holds & (has_free_finger | ~np.asarray(result.rest_certified))):
             sample = jax.tree.map(lambda leaf, k=k: leaf[k], sampled.scenes)
             holds[k] = simulate(sample, torque, arrival=arrival).status is Status.OK
         return result, SampleScore(float(holds.mean()), float(jnp.quantile(result.margins, quantile, method="lower")))

@@ -153,6 +153,11 @@ class Phase(eqx.Module):
     arrive: Arrival = eqx.field(static=True, default=Arrival.AT_REST)
     regrasp: str | None = eqx.field(static=True, default=None)
 
+    @property
+    def has_free_finger(self) -> bool:
+        """Whether a finger moves alone or stands away: only `simulate` judges what such a finger does."""
+        return self.regrasp is not None or self.formation.is_away is not None
+
 
 class Scene(eqx.Module):
     """A hand, an object, a rough start and a plan; every float in it can be differentiated with respect to.

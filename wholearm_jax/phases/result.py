@@ -195,7 +195,7 @@ def _holds(
 def _with_standing_fingers(scene: Scene, torque: TorqueSchedule, phase: Phase, one: PhaseResult) -> PhaseResult:
     """Judge a phase in which a finger is away or moves alone; return any other phase as it is."""
     known = int(one.traced.dynamics.status) == Status.OK
-    if not known or (phase.regrasp is None and not phase.formation.away):
+    if not known or not phase.has_free_finger:
         return one
     defect = find_standing_defect(scene, torque, phase, one.traced, one.start, one.duration)
     if defect is None or (one.status is not Status.OK and one.time < defect.time):
