@@ -11,9 +11,8 @@ from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.phases.plan_schedule import require_motion
 from wholearm_jax.phases.plan_tracing import trace
-from wholearm_jax.phases.rest_certificate import torques_of_step
 from wholearm_jax.phases.result import Result, build_result
-from wholearm_jax.simulation import IntegratorOptions, Motion, PhaseLoop, phase_loop
+from wholearm_jax.simulation import IntegratorOptions, Motion, PhaseLoop, phase_loop, torques_of_step
 
 MAX_CLOSED_LOOP_STEPS = 16384  # a phase, beyond which nothing is tried again
 

@@ -25,7 +25,7 @@ from wholearm_jax.model import (
 )
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.result import MIN_REST
-from wholearm_jax.simulation import Actuation, Motion, PhaseLoop, torque_of
+from wholearm_jax.simulation import Actuation, Motion, PhaseLoop, torques_of_step
 
 
 def certify_rest(
@@ -103,11 +103,3 @@ def _rest_torques(phase_schedule: PhaseSchedule, begin, end) -> Float[Array, "co
     ends = jnp.stack([torque_at(phase_schedule, row, at) for row, at in zip(rows, (begin, end), strict=True)])
     inside = (phase_schedule.phase_time > begin + near) & (phase_schedule.phase_time < end - near)
     return jnp.concatenate([ends, jnp.where(inside[:, None], phase_schedule.values, ends[0])])
-
-
-def torques_of_step(loop: PhaseLoop, motion: Motion, k) -> Float[Array, "corners 2"]:
-    """Return the torques of a closed loop where step `k` of a motion begins and ends."""
-    assert motion.memory is not None
-    nodes = jnp.stack([k, k + 1])
-    row = take_row(motion.row, k)
-    return jax.vmap(torque_of, (None, None, 0, 0))(loop, row, motion.phase_time[nodes], motion.memory[nodes])

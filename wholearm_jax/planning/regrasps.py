@@ -31,8 +31,7 @@ def separate_regrasps(moves: Sequence[Move]) -> tuple[tuple[Move, ...], tuple[Mo
     best: dict[str, Move] = {}
     others = []
     for move in moves:
-        finger = moving_finger(move)
-        if finger is None:
+        if moving_finger(move) is None:
             others.append(move)
         elif move.toward not in best or move.margins.min() > best[move.toward].margins.min():
             best[move.toward] = move

@@ -17,7 +17,7 @@ from wholearm_jax.simulation.interpolation import (
     evaluate_memory,
     quintic_hermite,
 )
-from wholearm_jax.simulation.motion_record import Motion
+from wholearm_jax.simulation.motion_record import Motion, torques_of_step
 from wholearm_jax.simulation.path_ode import (
     PathODE,
     join_state,

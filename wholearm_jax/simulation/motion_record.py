@@ -2,9 +2,12 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from wholearm_jax.core import take_row
+from wholearm_jax.simulation.closed_loop import PhaseLoop, torque_of
 from wholearm_jax.simulation.integrator import AcceptedSteps
 
 
@@ -29,6 +32,14 @@ class Motion(NamedTuple):
     `ambiguous`, `no_convergence` (of the step to an event) or `max_steps`."""
 
     memory: Float[Array, "nodes memory"] | None = None  # of a closed-loop law at the nodes
+
+
+def torques_of_step(loop: PhaseLoop, motion: Motion, k) -> Float[Array, "corners 2"]:
+    """Return the torques of a closed loop where step `k` of a motion begins and ends."""
+    assert motion.memory is not None
+    nodes = jnp.stack([k, k + 1])
+    row = take_row(motion.row, k)
+    return jax.vmap(torque_of, (None, None, 0, 0))(loop, row, motion.phase_time[nodes], motion.memory[nodes])
 
 
 class MotionRecord(NamedTuple):
