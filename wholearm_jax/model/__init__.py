@@ -3,6 +3,7 @@
 from wholearm_jax.model.hand_choice import HandChoice, choose_hand, resting_edges, scaled_hand
 from wholearm_jax.model.hand_collisions import LINK_OBSTACLES, LinkMeeting, link_obstacles, link_overlaps
 from wholearm_jax.model.kinematics import (
+    CORNER_TOL,
     FEATURE_GROUPS,
     FINGER_ROOT,
     PALM_END,

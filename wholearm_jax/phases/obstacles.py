@@ -18,6 +18,7 @@ from wholearm_jax.model import (
     link_overlaps,
     rigid_body,
 )
+from wholearm_jax.tracing import hold_same_tip, run_into_object
 
 LEVEL_ANGLE = 1e-9  # [rad], within which a finger is level with the palm
 
@@ -81,20 +82,31 @@ _overlaps = jax.jit(link_overlaps)
 
 
 def describe_refused_start(scene: Scene, phase: Phase, z: Float[Array, "5"]) -> str | None:
-    """Say why no path of a phase can begin at `z` (SI): overlaps, or contacts beyond their features; None: neither."""
-    along, lower, upper = (np.asarray(a) for a in _formation_places(scene, phase.formation, z))
+    """Say why no path of a phase can begin at `z` (SI); None where nothing overlaps and contacts are on their features.
+
+    A fingertip at a vertex is named where two contacts hold it, or the finger would cut the vertex off.
+    """
+    along, lower, upper, twice, inward = (np.asarray(a) for a in _formation_places(scene, phase.formation, z))
     beyond = np.maximum(lower - along, along - upper)
     names = [phase.formation.names[k] for k in phase.formation.contact_of_row]
     misplaced = dict.fromkeys(
         f"{names[k]} lies {1e3 * beyond[k]:.3g} mm beyond its feature" for k in np.flatnonzero(beyond > 1e-9)
     )
-    return "; ".join((*describe_overlaps(scene, z), *misplaced)) or None
+    corners = [
+        f"{names[i]} and {names[j]} hold a tip at a vertex, where it slips off along either side: keep one of the two"
+        for i, j in np.argwhere(np.triu(twice))
+    ]
+    corners += [f"{names[k]}: the finger comes from the object's side of that edge" for k in np.flatnonzero(inward)]
+    return "; ".join((*describe_overlaps(scene, z), *misplaced, *corners)) or None
 
 
 @jax.jit
 def _formation_places(scene: Scene, formation: ContactFormation, z):
-    contacts = contact_set(rigid_body(scene.object), scene.hand, formation)
-    return contact_kinematics(contacts, z).along, contacts.lower, contacts.upper
+    body = rigid_body(scene.object)
+    contacts = contact_set(body, scene.hand, formation)
+    at = contact_kinematics(contacts, z)
+    twice = hold_same_tip(contacts, at, contacts, at)
+    return at.along, contacts.lower, contacts.upper, twice, run_into_object(contacts, at, z, body.flush_tolerance)
 
 
 def _object_overlaps(scene: Scene, z, tolerance: float) -> list[str]:

@@ -15,10 +15,12 @@ from wholearm_jax.model import (
     Scene,
     constraint_jacobian,
     contact_formation,
+    contact_kinematics,
     feature_pair,
     rigid_body,
     scaled_mechanics,
 )
+from wholearm_jax.tracing import hold_same_tip
 
 WEDGING_CONDITION = 1e-6  # share of the largest singular value below which four constraints do not fix a path
 ROWS_STEP = 8  # contacts whose rows one program computes; their number is rounded up to a multiple
@@ -48,6 +50,8 @@ def path_choices(
 ) -> Iterator[tuple[tuple[str, ...], str]]:
     """Yield each formation of contacts whose constraints fix a path, with either direction along it.
 
+    Left out are those of which two contacts hold a fingertip at a vertex.
+
     Args:
         scene: the hand and the object.
         z: the configuration (5,), SI.
@@ -73,14 +77,23 @@ def _path_directions(scene: Scene, z, contacts: Sequence[str], combinations) -> 
     # The normal and the tangential row of each contact, as if all rolled: one program for up to `ROWS_STEP` contacts.
     padded = [*contacts, *[contacts[0]] * (-len(contacts) % ROWS_STEP)]
     every = contact_formation([f"{name} rolling" for name in padded])
-    rows = np.asarray(_constraint_rows(rigid_body(scene.object), scene.hand, scene.gravity, every, jnp.asarray(z)))
+    at_z = _constraint_rows(rigid_body(scene.object), scene.hand, scene.gravity, every, jnp.asarray(z))
+    rows, twice = (np.asarray(a) for a in at_z)
     rows_of = {name: rows[2 * k : 2 * k + 2] for k, name in enumerate(contacts)}
     rows_of |= {name: np.eye(5)[3 + k : 4 + k] for k, name in enumerate(AWAY_NAMES)}
+    number = {name: k for k, name in enumerate(contacts)}
     # A path's direction is the null vector of its four rows.
     stacked = np.stack([np.concatenate([_rows_held(rows_of, name) for name in names]) for names in combinations])
     _, values, right = np.linalg.svd(stacked)
     independent = values[:, -1] > WEDGING_CONDITION * values[:, 0]
-    return [right[k, 4] if independent[k] else None for k in range(len(combinations))]
+    may_hold = [not _holds_twice(names, number, twice[::2, ::2]) for names in combinations]
+    return [right[k, 4] if independent[k] and may_hold[k] else None for k in range(len(combinations))]
+
+
+def _holds_twice(names: Sequence[str], number: dict[str, int], twice: np.ndarray) -> bool:
+    """Whether two of the contacts hold one fingertip at a vertex; `twice` says so of each two of all."""
+    chosen = [number[pair] for name in names if (pair := feature_pair(name)) in number]
+    return bool(twice[np.ix_(chosen, chosen)].any())
 
 
 def _rows_held(rows_of: dict[str, np.ndarray], name: str) -> np.ndarray:
@@ -91,4 +104,6 @@ def _rows_held(rows_of: dict[str, np.ndarray], name: str) -> np.ndarray:
 @CachedJit
 def _constraint_rows(body, hand, gravity, formation, z):
     mechanics = scaled_mechanics(body, hand, gravity, formation)
-    return constraint_jacobian(mechanics.contacts, z / mechanics.configuration_unit)
+    small = z / mechanics.configuration_unit
+    contacts, at = mechanics.contacts, contact_kinematics(mechanics.contacts, small)
+    return constraint_jacobian(contacts, small), hold_same_tip(contacts, at, contacts, at)

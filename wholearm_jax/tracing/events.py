@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import eps_power
 from wholearm_jax.model import (
+    CORNER_TOL,
     Carrier,
     ContactSet,
     PathTarget,
@@ -29,6 +30,7 @@ from wholearm_jax.model import (
     feature_velocity,
     gap_velocity,
 )
+from wholearm_jax.tracing.corners import hold_same_tip
 
 COINCIDENT_FRACTION = 1e-7  # of a step, within which events count as met at the same place
 
@@ -62,6 +64,7 @@ class EventFunctions(NamedTuple):
     half_width: Float[Array, "rows"]  # size of the value at which a two-sided row is met
     is_terminal: Bool[Array, "rows"]
     two_sided: Bool[Array, "rows"]  # the value may start negative: then it is met from below
+    may_part: Bool[Array, "rows"]  # 0 at the start with a tip at a vertex that another contact holds: may turn negative
 
     def at(self, z: Float[Array, "5"], slope: Float[Array, "5"]) -> EventValues:
         """Evaluate the events at a place of the path, where `z` changes by `slope` a unit of `s`."""
@@ -97,11 +100,13 @@ def event_functions(mechanics: ScaledMechanics, target: PathTarget, z: Float[Arr
     pairs, held, links = mechanics.candidates, mechanics.contacts, mechanics.links
     until = target.until_coordinate >= 0
     # A vertex that begins flush on a link, a little behind it, may stay as deep as it is.
-    depth = -contact_kinematics(pairs, z).gap
+    at, at_held = contact_kinematics(pairs, z), contact_kinematics(held, z)
+    depth = -at.gap
     is_flush = (depth > eps_power(z, 5 / 8)) & (depth <= mechanics.flush_tolerance) & pairs.on_link
     flush_depth = jnp.where(is_flush & ~mechanics.may_be_behind, depth, 0.0)
     sense = jnp.where(target.until_value < z[target.until_coordinate], -1.0, 1.0)
     of_target = jnp.where(until, sense * target.until_value, 1.0)
+    may_part = (jnp.abs(depth) < CORNER_TOL) & hold_same_tip(pairs, at, held, at_held).any(1)
     one, none, far = jnp.ones_like(held.lower), jnp.zeros_like(held.lower), jnp.full_like(held.lower, jnp.inf)
     every, nothing, of_links = jnp.ones_like(pairs.lower), jnp.zeros_like(pairs.lower), jnp.zeros_like(links.gap)
 
@@ -129,6 +134,7 @@ def event_functions(mechanics: ScaledMechanics, target: PathTarget, z: Float[Arr
         half_width=rows(nothing, none, none, 0.0, links.half_width),
         is_terminal=rows(mechanics.may_terminate, one > 0, one > 0, True, links.exists),
         two_sided=rows(mechanics.may_be_behind, one < 0, one < 0, False, links.two_sided),
+        may_part=rows(may_part, one < 0, one < 0, False, links.exists & False),
     )
 
 
@@ -158,7 +164,8 @@ def detect_events(events: EventFunctions, before: EventValues, after: EventValue
     old, new = sense * before.values - events.half_width, sense * after.values - events.half_width
     leaving, arriving = sense * before.rates, sense * after.rates
     # From either side what is within the tolerance counts as in front.
-    through = (old >= -tolerance) & (new < -sense * tolerance)
+    parts = events.may_part & (jnp.abs(before.values) <= tolerance)
+    through = (old >= -tolerance) & (new < -sense * tolerance) & ~parts
     slope = jnp.where(arriving > leaving, arriving - leaving, 1.0)
     turns = (leaving < 0) & (arriving > 0) & (old > tolerance)
     sinks = turns & (old - step * leaving**2 / (2 * slope) < 0)

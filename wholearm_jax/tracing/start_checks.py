@@ -20,14 +20,15 @@ from wholearm_jax.model import (
     contact_kinematics,
     link_overlaps,
 )
+from wholearm_jax.tracing.corners import hold_same_tip, run_into_object
 
 
 def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) -> Bool[Array, ""]:
     """Whether a configuration `z` is inadmissible as a path's start.
 
     That is so where a contact lies beyond its feature, a vertex behind the palm, part of a link within the object, or a
-    convex object behind a finger on which one of its vertices slides. Behind a finger whose tip touches an edge,
-    vertices may lie.
+    convex object behind a finger on which one of its vertices slides, or where two contacts hold a fingertip at a
+    vertex, or the finger would cut that vertex off. Behind a finger whose tip touches an edge, vertices may lie.
     """
     tolerance = eps_power(z, 5 / 8)
     flush_tolerance = jnp.maximum(tolerance, mechanics.flush_tolerance)
@@ -43,7 +44,13 @@ def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) ->
         & inside
         & (pairs.gap < -flush_tolerance)
     )
-    return jnp.any(beyond) | jnp.any(behind) | link_penetrates_object(mechanics, pairs, flush_tolerance)
+    return (
+        jnp.any(beyond)
+        | jnp.any(behind)
+        | jnp.any(hold_same_tip(mechanics.contacts, contacts, mechanics.contacts, contacts))
+        | jnp.any(run_into_object(mechanics.contacts, contacts, z, flush_tolerance))
+        | link_penetrates_object(mechanics, pairs, flush_tolerance)
+    )
 
 
 def links_overlap(mechanics: ScaledMechanics, z: Float[Array, "5"]) -> Bool[Array, ""]:
