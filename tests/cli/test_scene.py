@@ -52,6 +52,14 @@ def test_a_box_from_a_drawing_rests_flush_on_the_palm(box, monkeypatch, capsys):
     np.testing.assert_array_equal(np.asarray(made.start), np.asarray(scene.start))
 
 
+def test_a_box_stands_on_the_side_that_is_asked_for(box, monkeypatch, capsys):
+    assert command(monkeypatch, "box.dxf", "--on", "e1") == 0
+    assert "40 mm wide, 60 mm high, on edge 1" in capsys.readouterr().out
+    scene = load_start("box.toml")
+    assert flush_sides(scene, touching_contacts(scene, scene.start)) == ("e1 on palm",)
+    np.testing.assert_allclose(np.asarray(scene.start[:3]), [0.0, 0.03, -np.pi / 2], atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -60,6 +68,7 @@ def test_a_box_from_a_drawing_rests_flush_on_the_palm(box, monkeypatch, capsys):
         (["ring.dxf"], "wholearm: ring.dxf: the outline has 1 hole; --fill-holes accepts it"),
         (["box.dxf", "--mass", "1", "--density", "1"], "wholearm: box.dxf: give mass or density, not both"),
         (["box.dxf", "--mass", "-1"], "wholearm: box.dxf: mass: must be positive, not -1"),
+        (["box.dxf", "--on", "e4"], "wholearm: box.dxf: e4: the outline's edges are e0 to e3"),
         (["box.dxf", "--unit", "parsec"], "wholearm: box.dxf: unit 'parsec' is not known"),
     ],
 )

@@ -53,6 +53,16 @@ def test_a_part_rests_where_it_tips_last():
     assert edges[2][1] == pytest.approx(np.arctan2(20, 30))
 
 
+def test_a_part_stands_on_the_edge_that_is_asked_for():
+    box = polygon(1e-3 * np.array(PARTS["box"], float), 0.1, 0.1)
+    standing = choose_hand(box, edge=1)
+    assert standing.edge == 1
+    assert (standing.width, standing.height) == pytest.approx((0.04, 0.06))
+    bracket = polygon(1e-3 * np.array(PARTS["bracket"], float), 0.1, 0.1)
+    with pytest.raises(ValueError, match=r"lies at rest on e0, .*not on e2"):  # the notch's floor
+        choose_hand(bracket, edge=2)
+
+
 def test_a_part_that_lies_on_no_edge_is_refused():
     """A star of five points stands on two of them."""
     angles = np.pi / 5 * np.arange(10)

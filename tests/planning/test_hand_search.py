@@ -1,5 +1,8 @@
 """The hand that is found: its plan arrives, no hand that was tried has a larger certificate, and it is found again."""
 
+import importlib
+from types import SimpleNamespace
+
 import equinox as eqx
 import numpy as np
 import pytest
@@ -50,6 +53,23 @@ def test_the_plan_on_the_best_hand_arrives(box, found):
     assert float(traced[-1].end[0] - box.start[0]) == pytest.approx(-0.004, abs=1e-3)
     assert np.asarray(best.scene.hand.length).tolist() == [found.best.length] * 2
     assert np.asarray(found.scene.hand.joint)[:, 0].tolist() == [found.best.joint, -found.best.joint]
+
+
+def test_the_search_widens_until_some_hand_has_a_plan(box, monkeypatch):
+    """Hands without a plan are searched again with more effort; those on which the part does not fit are not."""
+    module, efforts = importlib.import_module("wholearm_jax.planning.hand_search"), []
+
+    def plan(scene, goal, *, max_nodes, **options):
+        efforts.append(max_nodes)
+        enough = max_nodes == 3 and float(scene.hand.length[0]) == 0.12
+        return SimpleNamespace(found=enough, plans=(SimpleNamespace(bound=1.0),))
+
+    monkeypatch.setattr(module, "plan", plan)
+    monkeypatch.setattr(module, "EFFORTS", (1, 3, 9))
+    found = wa.plan_with_hand(box, by={"x": -0.004}, **SEARCH | {"max_nodes": None})
+    closing = sum(not np.isnan(trial.bound) for trial in found.trials)
+    assert efforts == [1] * closing + [3] * closing
+    assert found.best.length == 0.12
 
 
 def test_where_no_hand_has_a_plan_the_scene_stays(box):

@@ -22,6 +22,9 @@ def scene(
         float | None, typer.Option(help="Mass over area [kg/m^2]; 40, as of 15 mm of aluminium, unless given.")
     ] = None,
     friction: Annotated[float, typer.Option(help="Coulomb's coefficient of all contacts.")] = 0.1,
+    on: Annotated[
+        str | None, typer.Option(help="Edge to begin on: e0 joins the first two vertices; the steadiest unless given.")
+    ] = None,
     fill_holes: Annotated[
         bool, typer.Option("--fill-holes", help="Accept holes: nothing touches them, but they take from mass.")
     ] = False,
@@ -31,7 +34,7 @@ def scene(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write a scene from a drawing: the part at rest on its steadiest edge, in a hand that fits it."""
+    """Write a scene from a drawing: the part at rest on an edge, in a hand that fits it."""
     from wholearm_jax.core import write_atomically
     from wholearm_jax.files import choose_outline, describe_choice, outline_tables, read_outlines, scene_text
 
@@ -40,7 +43,7 @@ def scene(
         _list(outlines, as_json)
         raise BadInput(f"{drawing}: {len(outlines)} outlines; choose one with --outline 1 to {len(outlines)}")
     chosen = choose_outline(outlines, outline, fill_holes=fill_holes)
-    tables, choice = outline_tables(chosen, mass=mass, density=density, friction=friction)
+    tables, choice = outline_tables(chosen, mass=mass, density=density, friction=friction, on=on)
     lines = [f"{drawing.name}: {_describe(chosen)}", *describe_choice(choice)]
     given = "as given" if mass is not None else f"{density or 40.0:g} kg/m^2"
     lines.append(f"mass: {tables['object']['mass']:.4g} kg ({given}); friction: {friction:g}")

@@ -17,10 +17,10 @@ from wholearm_jax.feedback.reference_motion import (
 )
 from wholearm_jax.feedback.stop_torque import choose_push
 from wholearm_jax.feedback.torque_choice import TorqueChoice, choose_torques
-from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, contact_formation
+from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule
 from wholearm_jax.phases import (
     TracedPhase,
-    describe_end,
+    formation_at_end,
     group_phases,
     require_motion,
     simulate,
@@ -159,7 +159,7 @@ def _phase_law(
     made = int(traced.path.end_reason) == PathEnd.CONTACT_MADE and phase.arrive is not Arrival.MOVING
     press = 0.0
     if made:
-        closed = contact_formation((*phase.formation.names, describe_end(scenes[0], phase, traced).split()[0]))
+        closed = formation_at_end(scenes[0], phase, traced)
         press, gain_at_stop = choose_push(scenes, closed, np.asarray(traced.end), every, choice.torque[-1])
         gain[table.s > table.s[-1] - BEYOND] = gain_at_stop
     gain /= (gain * every[0].acceleration[:, 3:]).sum(1, keepdims=True)

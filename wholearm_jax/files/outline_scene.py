@@ -25,6 +25,7 @@ def scene_from_outline(
     mass: float | None = None,
     density: float | None = None,
     friction: float = DEFAULT_FRICTION,
+    on: str | None = None,
     title: str | None = None,
 ) -> Scene:
     """Make a scene without phases of an outline: a hand to start from, and the part at rest between its fingers.
@@ -34,6 +35,7 @@ def scene_from_outline(
         mass: [kg]; None: by density.
         density: mass over the outline's area without holes [kg/m^2]; None: that of 15 mm of aluminium.
         friction: Coulomb's coefficient of all contacts.
+        on: the edge to begin on, `e0` from the outline's first vertex to its second; None: the steadiest.
         title: of the scene; None: the file's name.
 
     Returns:
@@ -47,7 +49,7 @@ def scene_from_outline(
     >>> float(scene.object.mass), scene.phases
     (0.1, ())
     """
-    tables, _ = outline_tables(outline, mass=mass, density=density, friction=friction, title=title)
+    tables, _ = outline_tables(outline, mass=mass, density=density, friction=friction, on=on, title=title)
     return parse_start(tables, outline.source)
 
 
@@ -57,6 +59,7 @@ def outline_tables(
     mass: float | None = None,
     density: float | None = None,
     friction: float = DEFAULT_FRICTION,
+    on: str | None = None,
     title: str | None = None,
 ) -> tuple[dict[str, Any], HandChoice]:
     """Return the tables of a scene file for an outline, and how its hand was chosen; arguments as of
@@ -73,8 +76,9 @@ def outline_tables(
         table["inertia"] = float(f"{weight * outline.second_moment / outline.area:.6g}")
         table["center_of_mass"] = np.round(outline.centroid, 9).tolist()
     shape = polygon(outline.vertices, weight, friction, table.get("inertia"), table.get("center_of_mass"))
+    edge = None if on is None else _edge_number(outline, on)
     try:
-        choice = choose_hand(shape)
+        choice = choose_hand(shape, edge)
     except ValueError as error:
         raise SceneError(f"{outline.source}: {error}") from None
     rows = [
@@ -92,6 +96,14 @@ def outline_tables(
     return tables, choice
 
 
+def _edge_number(outline: Outline, name: str) -> int:
+    """Read the name of an edge."""
+    number, count = name.removeprefix("e"), len(outline.vertices)
+    if not (number.isdecimal() and int(number) < count):
+        raise SceneError(f"{outline.source}: {name}: the outline's edges are e0 to e{count - 1}")
+    return int(number)
+
+
 def scene_text(tables: Mapping[str, Any], comments: list[str]) -> str:
     """Write a scene's tables as TOML, below lines of comment; each row of numbers in a line."""
     text = _ROW.sub(lambda row: f"[{', '.join(row[1].split())}]".replace(",,", ","), tomli_w.dumps(tables))
@@ -105,7 +117,7 @@ def describe_choice(choice: HandChoice) -> list[str]:
     width, height = choice.width, choice.height
     return [
         f"part at rest: {1e3 * width:.4g} mm wide, {1e3 * height:.4g} mm high, on edge {choice.edge}, from which it "
-        f"tips last, at {math.degrees(choice.tipping_angle):.3g} degrees",
+        f"tips at {math.degrees(choice.tipping_angle):.3g} degrees",
         f"hand: joints {1e3 * span:.4g} mm apart, {span / width:.3g} times its width; fingers {1e3 * length:.4g} mm "
         f"long, {length / (width + height):.3g} times its width and height together: both close on it",
     ]

@@ -40,29 +40,35 @@ class HandChoice(NamedTuple):
     height: float
 
 
-def choose_hand(shape: Polygon) -> HandChoice:
+def choose_hand(shape: Polygon, edge: int | None = None) -> HandChoice:
     """Choose a hand for an object, and an edge to begin on.
 
     Args:
         shape: the object.
+        edge: number of the edge to begin on; None: the steadiest on which a hand closes on the object.
 
     Raises:
-        ValueError: if the object can rest on none of its edges, or no hand of the design closes on it.
+        ValueError: if the object can rest on none of its edges, or not on that one, or no hand of the design closes on
+            it.
     """
     body = rigid_body(shape)
     corners = np.asarray(body.vertices)[: int(body.count)]
     edges = resting_edges(corners)
     if not edges:
         raise ValueError("the object can lie at rest on none of its edges")
-    for clearance, (edge, tipping_angle) in itertools.product(CLEARANCE, edges):
-        at = _laid_down(corners, edge)
+    allowed = [row for row in edges if edge is None or row[0] == edge]
+    if not allowed:
+        raise ValueError(f"the object lies at rest on {', '.join(f'e{k}' for k, _ in sorted(edges))}, not on e{edge}")
+    for clearance, (on, tipping_angle) in itertools.product(CLEARANCE, allowed):
+        at = _laid_down(corners, on)
         width, height = np.ptp(at, axis=0).tolist()
         x = round(-(at[:, 0].min() + at[:, 0].max()) / 2, _DIGITS) + 0.0
         for span, reach in itertools.product(SPAN, REACH):
             hand = scaled_hand(span * width, reach * (width + height), float(body.mass))
-            if _fits(shape, hand, edge, x, clearance * (width + height)):
-                return HandChoice(hand, edge, x, tipping_angle, width, height)
-    raise ValueError("no hand closes on the object on any edge on which it can lie")
+            if _fits(shape, hand, on, x, clearance * (width + height)):
+                return HandChoice(hand, on, x, tipping_angle, width, height)
+    where = "any edge on which it can lie" if edge is None else f"e{edge}"
+    raise ValueError(f"no hand closes on the object on {where}")
 
 
 def resting_edges(corners: Float[np.ndarray, "count 2"]) -> list[tuple[int, float]]:

@@ -121,7 +121,7 @@ def contact_set(body: RigidBody, hand: Hand, formation: ContactFormation) -> Con
         edge=components(extent / length[:, None]),
         lower=jnp.where(on_link & palm, palm_lower, beside),
         upper=jnp.where(on_link, jnp.where(palm, palm_upper, reach), length - beside),
-        friction=body.friction[formation.link],
+        friction=body.friction[jnp.where(formation.kind == PALM_END, 0, formation.link)],
         tangential=formation.tangential,
         slides=~formation.tangential & ~jnp.roll(formation.tangential, -1),
         rolling_anchor=jnp.zeros_like(length),

@@ -18,6 +18,7 @@ from wholearm_jax.phases.phase_ends import (
     configuration,
     describe_end,
     final_configuration,
+    formation_at_end,
     statics_at_start,
     target_configuration,
 )

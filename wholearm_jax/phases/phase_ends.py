@@ -6,7 +6,16 @@ from jaxtyping import Array, Float, Int
 
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.margin import RestAccelerations, Statics, contact_statics
-from wholearm_jax.model import FEATURE_GROUPS, FINGER_ROOT, PALM_END, Arrival, Phase, Scene, contact_name
+from wholearm_jax.model import (
+    FEATURE_GROUPS,
+    FINGER_ROOT,
+    PALM_END,
+    Arrival,
+    ContactFormation,
+    Phase,
+    Scene,
+    contact_name,
+)
 from wholearm_jax.phases.obstacles import describe_obstacle
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.simulation import Motion
@@ -45,6 +54,15 @@ def statics_at_start(scene: Scene, phase: Phase, traced: TracedPhase) -> tuple[S
     )
     statics = contact_statics(scene, phase.formation, traced.begin)
     return statics, RestAccelerations(forward[[0, 3, 4]], backward)
+
+
+def formation_at_end(scene: Scene, phase: Phase, traced: TracedPhase) -> ContactFormation:
+    """Return a phase's formation with the contact that ends its path, a corner of a link on an edge included."""
+    group, feature = divmod(int(traced.path.end_contact), scene.object.vertices.shape[0])
+    link, kind = FEATURE_GROUPS[group]
+    held = phase.formation
+    rows = zip((held.link, held.kind, held.feature, held.tangential), (link, kind, feature, False), strict=True)
+    return ContactFormation(*(jnp.append(column, value) for column, value in rows))
 
 
 def describe_end(scene: Scene, phase: Phase, traced: TracedPhase) -> str:

@@ -2,11 +2,12 @@
 
 Hands of a grid over finger length and joint distance are tried, then those about the best one at half the spacing. On
 each the object begins as in the scene, lying on the same edge, with the fingers closed anew. The search on each hand is
-limited by configurations, not by time, so that the same call finds the same hand.
+limited by configurations, few at first and more where no hand has a plan with so few: near goals are quick, far ones
+found.
 """
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from wholearm_jax.core import as_device_array
 from wholearm_jax.model import Hand, Scene, edge_on_palm, link_overlaps, resting_configuration
 from wholearm_jax.planning.search import PlanningResult, plan
 
+EFFORTS = (12, 48, 192)  # configurations that the search on each hand expands, until some hand has a plan
 PROPORTION_DECIMALS = 4  # of the lengths that are tried [m]
 
 
@@ -50,7 +52,7 @@ def plan_with_hand(
     joint: tuple[float, float],
     grid: int = 4,
     refinements: int = 1,
-    max_nodes: int = 12,
+    max_nodes: int | None = None,
     callback: Callable[[int, float], None] | None = None,
     **options: Any,
 ) -> HandSearchResult:
@@ -64,7 +66,8 @@ def plan_with_hand(
         joint: least and largest distance of each joint from the middle [m].
         grid: number of values of each in the first round.
         refinements: rounds about the best hand, each at half the spacing of the one before.
-        max_nodes: configurations that the search on each hand expands.
+        max_nodes: configurations that the search on each hand expands; unless given 12, or where no hand has a plan
+            with those, 48 or at last 192.
         callback: called with the number of hands tried and the largest certificate so far.
         options: other arguments of `plan`: `by`, `tolerance`, `margin`, `count`, `max_phases`, `rolling`.
 
@@ -77,19 +80,23 @@ def plan_with_hand(
     edge = edge_on_palm(scene.object, np.asarray(scene.start))
     tried: dict[tuple[float, float], tuple[HandTrial, Scene, PlanningResult | None]] = {}
 
-    def attempt(proportions: tuple[float, float]) -> None:
-        if proportions in tried:
-            return
-        changed = _start_in(scene, edge, *proportions)
-        found = None if changed is None else plan(changed, goal, max_nodes=max_nodes, **options)
-        bound = np.nan if found is None else found.plans[0].bound if found.found else -np.inf
-        tried[proportions] = HandTrial(*proportions, float(bound)), changed or scene, found
-        if callback is not None:
-            callback(len(tried), max((one.bound for one, _, _ in tried.values() if one.bound > 0), default=0.0))
+    def attempt(every: Iterable[tuple[float, float]], effort: int) -> None:
+        for proportions in every:
+            if proportions in tried and (tried[proportions][0].bound != -np.inf):
+                continue  # has its plan, or does not close on the object
+            changed = _start_in(scene, edge, *proportions)
+            found = None if changed is None else plan(changed, goal, max_nodes=effort, **options)
+            bound = np.nan if found is None else found.plans[0].bound if found.found else -np.inf
+            tried[proportions] = HandTrial(*proportions, float(bound)), changed or scene, found
+            if callback is not None:
+                callback(len(tried), max((one.bound for one, _, _ in tried.values() if one.bound > 0), default=0.0))
 
     ranges = [length, joint]
-    for one, other in itertools.product(*(_values(*limits, grid) for limits in ranges)):
-        attempt((one, other))
+    effort = 0
+    for effort in EFFORTS if max_nodes is None else (max_nodes,):
+        attempt(itertools.product(*(_values(*limits, grid) for limits in ranges)), effort)
+        if _best(tried) is not None:
+            break
     spacing = [(high - low) / max(grid - 1, 1) for low, high in ranges]
     for _ in range(refinements):
         best = _best(tried)
@@ -100,8 +107,7 @@ def plan_with_hand(
             _values(max(centre - step, low), min(centre + step, high), 3)
             for centre, step, (low, high) in zip(best, spacing, ranges, strict=True)
         ]
-        for one, other in itertools.product(*near):
-            attempt((one, other))
+        attempt((proportions for proportions in itertools.product(*near) if proportions not in tried), effort)
     best = _best(tried)
     trials = tuple(trial for trial, _, _ in tried.values())
     return HandSearchResult(None, scene, None, trials) if best is None else HandSearchResult(*tried[best], trials)
