@@ -52,6 +52,12 @@ def test_a_box_from_a_drawing_rests_flush_on_the_palm(box, monkeypatch, capsys):
     np.testing.assert_array_equal(np.asarray(made.start), np.asarray(scene.start))
 
 
+def test_each_link_has_its_friction(box, monkeypatch, capsys):
+    assert command(monkeypatch, "box.dxf", "--friction", "palm=0.5,finger1=0.2,finger2=0.1") == 0
+    assert "friction: palm=0.5,finger1=0.2,finger2=0.1" in capsys.readouterr().out
+    assert np.asarray(load_start("box.toml").object.friction).tolist() == [0.5, 0.2, 0.1]
+
+
 def test_a_box_stands_on_the_side_that_is_asked_for(box, monkeypatch, capsys):
     assert command(monkeypatch, "box.dxf", "--on", "e1") == 0
     assert "40 mm wide, 60 mm high, on edge 1" in capsys.readouterr().out
@@ -69,6 +75,8 @@ def test_a_box_stands_on_the_side_that_is_asked_for(box, monkeypatch, capsys):
         (["box.dxf", "--mass", "1", "--density", "1"], "wholearm: box.dxf: give mass or density, not both"),
         (["box.dxf", "--mass", "-1"], "wholearm: box.dxf: mass: must be positive, not -1"),
         (["box.dxf", "--on", "e4"], "wholearm: box.dxf: e4: the outline's edges are e0 to e3"),
+        (["box.dxf", "--friction", "much"], "wholearm: --friction much: write a number, or palm=0.5"),
+        (["box.dxf", "--friction", "palm=0.5"], "wholearm: box.dxf: friction: give one number, or one for each of"),
         (["box.dxf", "--unit", "parsec"], "wholearm: box.dxf: unit 'parsec' is not known"),
     ],
 )

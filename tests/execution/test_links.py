@@ -11,6 +11,7 @@ from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.execution.executions import ExecutionOutcome, execute, run_schedule
+from wholearm_jax.execution.link_meetings import unexpected_meetings
 from wholearm_jax.execution.mujoco_model import CONVEX, build_mujoco_model
 
 DATA = Path(__file__).parents[1] / "data"
@@ -81,3 +82,13 @@ def test_a_joint_stops_at_the_end_of_its_range_and_a_tip_on_the_palm(crossing, s
     assert "finger1 meets the palm" in met
     tip = 0.08 + LENGTH * np.sin(course.z[-1, 3])
     assert abs(tip) < 1e-4
+
+
+def test_a_range_may_end_where_a_phase_does(crossing):
+    """A joint that a plan leads to the end of its range meets it, which is no fault; elsewhere it is."""
+    end, range_end = crossing.phases[-1].traced.end[4], "finger2 reaches its range"
+    assert unexpected_meetings(crossing, {range_end}) == {range_end}
+    bounded = eqx.tree_at(lambda s: s.hand.range, crossing.scene, crossing.scene.hand.range.at[1, 1].set(end))
+    assert unexpected_meetings(replace(crossing, scene=bounded), {range_end, "finger1 meets finger2"}) == {
+        "finger1 meets finger2"
+    }

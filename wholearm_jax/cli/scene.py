@@ -21,7 +21,9 @@ def scene(
     density: Annotated[
         float | None, typer.Option(help="Mass over area [kg/m^2]; 40, as of 15 mm of aluminium, unless given.")
     ] = None,
-    friction: Annotated[float, typer.Option(help="Coulomb's coefficient of all contacts.")] = 0.1,
+    friction: Annotated[
+        str, typer.Option(help="Coulomb's coefficient of all contacts, or palm=0.5,finger1=0.1,finger2=0.1.")
+    ] = "0.1",
     on: Annotated[
         str | None, typer.Option(help="Edge to begin on: e0 joins the first two vertices; the steadiest unless given.")
     ] = None,
@@ -43,10 +45,10 @@ def scene(
         _list(outlines, as_json)
         raise BadInput(f"{drawing}: {len(outlines)} outlines; choose one with --outline 1 to {len(outlines)}")
     chosen = choose_outline(outlines, outline, fill_holes=fill_holes)
-    tables, choice = outline_tables(chosen, mass=mass, density=density, friction=friction, on=on)
+    tables, choice = outline_tables(chosen, mass=mass, density=density, friction=_read_friction(friction), on=on)
     lines = [f"{drawing.name}: {_describe(chosen)}", *describe_choice(choice)]
     given = "as given" if mass is not None else f"{density or 40.0:g} kg/m^2"
-    lines.append(f"mass: {tables['object']['mass']:.4g} kg ({given}); friction: {friction:g}")
+    lines.append(f"mass: {tables['object']['mass']:.4g} kg ({given}); friction: {friction}")
     path = out or Path(drawing.with_suffix(".toml").name)
     if out is None and path.exists():
         raise BadInput(f"{path}: there already; name another file with --out, or this one to replace it")
@@ -60,6 +62,16 @@ def scene(
     print("\n".join(lines))
     span = 2 * tables["hand"]["finger1"]["joint"][0]
     print(f"-> {path}; go on with: wholearm plan {path} --by x={-(span - choice.width) / 4:.1g}")
+
+
+def _read_friction(text: str) -> float | dict[str, float]:
+    """Read `0.1`, or `palm=0.5,finger1=0.1,finger2=0.1`."""
+    try:
+        if "=" not in text:
+            return float(text)
+        return {name.strip(): float(value) for name, value in (part.split("=") for part in text.split(","))}
+    except ValueError:
+        raise BadInput(f"--friction {text}: write a number, or palm=0.5,finger1=0.1,finger2=0.1") from None
 
 
 def _describe(outline) -> str:

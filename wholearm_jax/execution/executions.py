@@ -29,6 +29,7 @@ from wholearm_jax.execution.closed_loop import (
     closed_loop_step,
 )
 from wholearm_jax.execution.coulomb_friction import advance
+from wholearm_jax.execution.link_meetings import record_meetings, unexpected_meetings
 from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
 from wholearm_jax.feedback import Controller
 from wholearm_jax.model import (
@@ -136,7 +137,10 @@ class Execution:
         off = f"{1e3 * self.position_error:.3g} mm and {abs(self.angle_error):.2g} rad from the predicted end"
         why = f" at {', '.join(self.open_at_end)}" if self.open_at_end else ""
         if self.ending is ExecutionOutcome.LINKS_MET:
-            why = ": " + ", ".join(f"{name} at {time:.4g} s" for name, time in self.link_contacts.items())
+            meetings = unexpected_meetings(self.prediction, self.link_contacts)
+            why = ": " + ", ".join(
+                f"{name} at {time:.4g} s" for name, time in self.link_contacts.items() if name in meetings
+            )
         if self.ending is ExecutionOutcome.DIVERGED:
             crept = f"contacts crept {1e3 * self.creep:.3g} mm"
             why = f" ({crept if np.isfinite(self.creep) else 'MuJoCo gave up'}: take a shorter time step)"
@@ -174,7 +178,7 @@ def execute(
     bodies = build_mujoco_model(scene, step, softness)
     course, creep, met = run_schedule(bodies, scene, start_of(prediction), torques, step)
     expected, target = _expected(prediction, bodies.names), target_of(prediction)
-    unexpected = {} if meets_obstacle(prediction) else met
+    unexpected = unexpected_meetings(prediction, met)
     ending, lost = assess_execution(scene, course.z[-1], target, tolerance, creep, unexpected)
     return Execution(
         prediction=prediction,
@@ -191,11 +195,6 @@ def execute(
         timestep=step,
         model_xml=bodies.xml,
     )
-
-
-def meets_obstacle(prediction: Result) -> bool:
-    """Whether the prediction itself ends where links meet or a joint's range ends."""
-    return any(bool(phase.traced.dynamics.ends_at_obstacle) for phase in prediction.phases)
 
 
 def require_wires(prediction: Result) -> None:
@@ -272,7 +271,7 @@ def rollout(bodies: MujocoModel, start, torques: Float[np.ndarray, "steps 2"] | 
         found, wrong = step(bodies, data, torque, found)
         forces.append(found)
         last, creep = torque, creep + wrong * bodies.model.opt.timestep
-        _record_meetings(bodies, data, (len(z) - 1) * bodies.model.opt.timestep, met)
+        record_meetings(bodies, data, (len(z) - 1) * bodies.model.opt.timestep, met)
     z.append(data.qpos.copy())
     z_dot.append(data.qvel.copy())
     forces.append(step(bodies, data, last, found)[0])  # beyond the end, for the forces there
@@ -283,19 +282,6 @@ def rollout(bodies: MujocoModel, start, torques: Float[np.ndarray, "steps 2"] | 
 def _scheduled_motor(torques: Float[np.ndarray, "steps 2"]) -> Motor:
     """Return the motor that follows torques known beforehand."""
     return lambda k, angles: torques[k] if k < len(torques) else None
-
-
-def _record_meetings(bodies: MujocoModel, data: mujoco.MjData, time: float, met: dict[str, float]) -> None:
-    """Note the time of links that touch for the first time, and of joints at the ends of their ranges."""
-    geom = data.contact.geom
-    if len(geom):
-        rows = bodies.pair[geom[:, 0], geom[:, 1]] - len(bodies.names)
-        for row in rows[rows >= 0]:
-            met.setdefault(bodies.link_meetings[row], time)
-    if data.nl:
-        beyond = (data.qpos[3:] < bodies.model.jnt_range[3:, 0]) | (data.qpos[3:] > bodies.model.jnt_range[3:, 1])
-        for finger in np.flatnonzero(beyond):
-            met.setdefault(f"finger{finger + 1} reaches its range", time)
 
 
 def stepper(bodies: MujocoModel) -> Callable:

@@ -38,13 +38,13 @@ from wholearm_jax.execution.executions import (
     Tolerance,
     assess_execution,
     clock,
-    meets_obstacle,
     motor_torques,
     require_wires,
     rollout,
     start_of,
     target_of,
 )
+from wholearm_jax.execution.link_meetings import unexpected_meetings
 from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
 from wholearm_jax.feedback import Controller
 from wholearm_jax.model import (
@@ -162,9 +162,8 @@ def run_trials(
     copies = ((build_mujoco_model(scene, step, softness), path.start) for scene, path in zip(scenes, laid, strict=True))
     found = rollout_in_parallel(copies, drives, min(workers or os.cpu_count() or 1, count))
     runs = []
-    expected = meets_obstacle(prediction)
     for scene, own, (end, creep, met) in zip(scenes, laid, found, strict=True):
-        targets, reached = (target, own.target), (end, creep, {} if expected else met)
+        targets, reached = (target, own.target), (end, creep, unexpected_meetings(prediction, met))
         runs.append(_summary(prediction.scene, scene, targets, reached, tolerance))
         if callback is not None:
             callback(runs[-1])

@@ -12,10 +12,11 @@ from wholearm_jax.core import SceneError
 from wholearm_jax.files.outlines import Outline
 from wholearm_jax.files.scene_schema import FingerTable
 from wholearm_jax.files.scene_toml import parse_start
-from wholearm_jax.model import HandChoice, Scene, choose_hand, polygon
+from wholearm_jax.model import LINKS, HandChoice, Scene, choose_hand, polygon
 
 DEFAULT_DENSITY = 40.0  # [kg/m^2]: 15 mm of aluminium
 DEFAULT_FRICTION = 0.1
+MASSES = ("mass", "density")
 _ROW = re.compile(r"\[\s+([^\[\]]*?),\s+\]")
 
 
@@ -24,7 +25,7 @@ def scene_from_outline(
     *,
     mass: float | None = None,
     density: float | None = None,
-    friction: float = DEFAULT_FRICTION,
+    friction: float | Mapping[str, float] = DEFAULT_FRICTION,
     on: str | None = None,
     title: str | None = None,
 ) -> Scene:
@@ -34,7 +35,7 @@ def scene_from_outline(
         outline: the part, as `read_outline` returns it.
         mass: [kg]; None: by density.
         density: mass over the outline's area without holes [kg/m^2]; None: that of 15 mm of aluminium.
-        friction: Coulomb's coefficient of all contacts.
+        friction: Coulomb's coefficient of all contacts, or of each link's: `{"palm": 0.5, "finger1": 0.1, ...}`.
         on: the edge to begin on, `e0` from the outline's first vertex to its second; None: the steadiest.
         title: of the scene; None: the file's name.
 
@@ -58,7 +59,7 @@ def outline_tables(
     *,
     mass: float | None = None,
     density: float | None = None,
-    friction: float = DEFAULT_FRICTION,
+    friction: float | Mapping[str, float] = DEFAULT_FRICTION,
     on: str | None = None,
     title: str | None = None,
 ) -> tuple[dict[str, Any], HandChoice]:
@@ -66,16 +67,27 @@ def outline_tables(
     `scene_from_outline`."""
     if mass is not None and density is not None:
         raise SceneError(f"{outline.source}: give mass or density, not both")
-    for name, value in {"mass": mass, "density": density, "friction": friction}.items():
-        if value is not None and not (math.isfinite(value) and (value > 0 or (name == "friction" and value == 0))):
+    of_links = dict(friction) if isinstance(friction, Mapping) else dict.fromkeys(LINKS, friction)
+    if of_links.keys() != {*LINKS}:
+        raise SceneError(f"{outline.source}: friction: give one number, or one for each of {', '.join(LINKS)}")
+    given = {"mass": mass, "density": density} | {f"friction of {link}": value for link, value in of_links.items()}
+    for name, value in given.items():
+        if value is not None and not (math.isfinite(value) and (value > 0 or (name not in MASSES and value == 0))):
             raise SceneError(f"{outline.source}: {name}: must be positive, not {value:g}")
     weight = mass if mass is not None else (density or DEFAULT_DENSITY) * outline.area
     weight = float(f"{weight:.6g}")
-    table: dict[str, Any] = {"vertices": outline.vertices.tolist(), "mass": weight, "friction": friction}
+    one = len({*of_links.values()}) == 1
+    table: dict[str, Any] = {
+        "vertices": outline.vertices.tolist(),
+        "mass": weight,
+        "friction": of_links["palm"] if one else of_links,
+    }
     if outline.holes:
         table["inertia"] = float(f"{weight * outline.second_moment / outline.area:.6g}")
         table["center_of_mass"] = np.round(outline.centroid, 9).tolist()
-    shape = polygon(outline.vertices, weight, friction, table.get("inertia"), table.get("center_of_mass"))
+    shape = polygon(
+        outline.vertices, weight, [of_links[link] for link in LINKS], table.get("inertia"), table.get("center_of_mass")
+    )
     edge = None if on is None else _edge_number(outline, on)
     try:
         choice = choose_hand(shape, edge)
