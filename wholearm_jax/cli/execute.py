@@ -21,6 +21,8 @@ from wholearm_jax.cli.prediction import read_controller_of, simulate_or_exit, tr
 from wholearm_jax.cli.progress import count_progress
 from wholearm_jax.cli.tables import print_json
 
+PUSH_HELP = "An impulse [N s; N m s] during 10 ms, from a time [s] on, e.g. 'x=0.002@0.4'. May be repeated."
+
 
 def execute(
     scene: SceneName,
@@ -37,6 +39,7 @@ def execute(
     mass: Annotated[str, typer.Option(help="Perturbation of the mass, e.g. 5%.")] = "5%",
     geometry: Annotated[float, typer.Option(min=0.0, help="Perturbation of the vertices [m].")] = 5e-4,
     start: Annotated[float, typer.Option(min=0.0, help="Perturbation of the start [m].")] = 5e-4,
+    push: Annotated[list[str] | None, typer.Option(help=PUSH_HELP)] = None,
     rate: Annotated[float, typer.Option(min=1.0, help="Sampling rate of the controller [Hz].")] = 1000.0,
     delay: Annotated[float, typer.Option(min=0.0, help="From measurement to torque [s].")] = 1e-3,
     counts: Annotated[int, typer.Option(min=0, help="Encoder counts a turn (0: exact).")] = 4096,
@@ -72,6 +75,7 @@ def execute(
             require_objects(loaded, amounts)
         except ValueError as error:
             raise BadInput(f"--{error}") from None
+    pushes = tuple(_read_push(text) for text in push or ())
     folder = make_output_folder(out)
     prediction, law = _predict(scene, loaded, torque, controller)
     if not as_json and law is None:
@@ -83,9 +87,11 @@ def execute(
             print_json({"prediction": {"status": prediction.status.label, "message": prediction.message}})
         sys.exit(1)
     settings = {"timestep": timestep, "tolerance": Tolerance(position, angle), "controller": law, "hardware": hardware}
+    settings |= {"pushes": pushes}
     execution = rollout(prediction, seed=seed, **settings)
     trials = _run_trials(prediction, perturb, amounts, seed=seed, **settings) if perturb else None
     more = {"torque": str(torque)} if law is None else {"controller": str(controller), "hardware": hardware._asdict()}
+    more |= {"pushes": [dict(one._asdict(), impulse=one.impulse.tolist()) for one in pushes]} if pushes else {}
     content = execution_summary(execution, trials, **more)
     ok = execution.ending is ExecutionOutcome.OK
     folder = folder if folder and may_replace(folder, EXECUTION_FILES, ok) else None
@@ -123,6 +129,19 @@ def _fraction(option: str, text: str) -> float:
     if not 0 <= fraction < 1:
         raise BadInput(f"{option} {text}: write a share between 0 and 1, e.g. 10% or 0.1")
     return fraction
+
+
+def _read_push(text: str):
+    """Read `x=0.002@0.4`, or impulses along several coordinates, `x=0.002,y=-0.001@0.4`."""
+    from wholearm_jax.execution import push
+
+    impulses, _, time = text.rpartition("@")
+    try:
+        pairs = [part.partition("=") for part in impulses.split(",")]
+        return push(float(time), **{name.strip(): float(value) for name, _, value in pairs})
+    except ValueError as error:
+        why = f": {error}" if str(error).startswith("push") else ""
+        raise BadInput(f"--push {text}: write COORDINATE=IMPULSE@TIME, e.g. 'x=0.002@0.4'{why}") from None
 
 
 def _print_execution(execution, trials, folder: Path | None) -> None:

@@ -27,28 +27,28 @@ EXACT, ROUNDS = 1e-6, 100  # when to stop: share of the largest friction by whic
 
 
 def advance(
-    bodies: MujocoModel, data, torque, before: Float[np.ndarray, "pairs 2"]
+    bodies: MujocoModel, data, torque, before: Float[np.ndarray, "pairs 2"], push: float | Float[np.ndarray, "5"] = 0.0
 ) -> tuple[Float[np.ndarray, "pairs 2"], float]:
     """One time step under `torque`: the forces `(c_n, c_t)` [N] of all pairs on the object, and how wrong they are.
 
-    `before` are those of the step before, from which friction is looked for. The second is the largest speed [m/s] by
-    which a contact slips in this step against Coulomb's law: by `SOLVER_TOL` of what friction can do in a step, more
-    where
-    `ROUNDS` were not enough (at rest, where the friction of several contacts is not determined), and much where no
-    forces agree with that law, as there need not be any if friction is large.
+    `push` is a generalised force [N; N m] on all coordinates beside them; friction is looked for from `before`, that of
+    the step before. The second is the largest speed [m/s] by which a contact slips in this step against Coulomb's law:
+    by `EXACT` of what friction can do in a step, more where `ROUNDS` were not enough (at rest, where the friction of
+    several contacts is not determined), and much where no forces agree with that law, as there need not be any if
+    friction is large.
     """
     mujoco.mj_step1(bodies.model, data)
     data.ctrl[:] = torque
     pair, address, rows = _touching(bodies, data)
-    friction, wrong = _settled(bodies, data, pair, address, rows, before[pair, 1])
-    data.qfrc_applied[:] = friction @ rows
+    friction, wrong = _settled(bodies, data, pair, address, rows, before[pair, 1], push)
+    data.qfrc_applied[:] = friction @ rows + push
     mujoco.mj_step2(bodies.model, data)
     forces = np.zeros_like(before)
     np.add.at(forces, pair, np.stack([data.efc_force[address], friction], axis=1))
     return forces, wrong
 
 
-def _settled(bodies: MujocoModel, data, pair, address, rows, ct) -> tuple[Float[np.ndarray, "touching"], float]:
+def _settled(bodies: MujocoModel, data, pair, address, rows, ct, push) -> tuple[Float[np.ndarray, "touching"], float]:
     """Friction forces that agree with Coulomb's law, and by how much slips do not [m/s]."""
     if not len(pair):
         return ct, 0.0
@@ -57,7 +57,7 @@ def _settled(bodies: MujocoModel, data, pair, address, rows, ct) -> tuple[Float[
     mujoco.mj_fwdActuation(bodies.model, data)
     wrong = np.inf
     for _ in range(ROUNDS):
-        data.qfrc_applied[:] = ct @ rows
+        data.qfrc_applied[:] = ct @ rows + push
         mujoco.mj_fwdAcceleration(bodies.model, data)
         mujoco.mj_fwdConstraint(bodies.model, data)
         most = mu * data.efc_force[address]

@@ -12,7 +12,7 @@ lies on its feature.
 # pyright: reportAttributeAccessIssue=false
 
 import enum
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -31,6 +31,7 @@ from wholearm_jax.execution.closed_loop import (
 from wholearm_jax.execution.coulomb_friction import advance
 from wholearm_jax.execution.link_meetings import record_meetings, unexpected_meetings
 from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
+from wholearm_jax.execution.pushes import Push, push_force
 from wholearm_jax.feedback import Controller
 from wholearm_jax.model import (
     Arrival,
@@ -160,12 +161,14 @@ def execute(
     tolerance: Tolerance = Tolerance(),
     controller: Controller | None = None,
     hardware: Hardware = Hardware(),
+    pushes: Sequence[Push] = (),
     seed: int = 0,
 ) -> Execution:
     """Drive the free bodies by a predicted plan's torque schedule or a controller, from its start to its end.
 
     The prediction may fail, but its paths must be known: raises ValueError where one could not be traced, and for a
-    `timestep` that is not positive. A controller measures and acts through `hardware`, whose noise `seed` draws.
+    `timestep` that is not positive. A controller measures and acts through `hardware`, whose noise `seed` draws; it
+    does not see `pushes`, which act on the bodies beside the torques.
     """
     require_positive(timestep=timestep)
     scene = prediction.scene
@@ -176,7 +179,7 @@ def execute(
         step = closed_loop_step(controller, hardware, scene, timestep)
         torques = ControlledMotor(controller, hardware, step, seed)
     bodies = build_mujoco_model(scene, step, softness)
-    course, creep, met = run_schedule(bodies, scene, start_of(prediction), torques, step)
+    course, creep, met = run_schedule(bodies, scene, start_of(prediction), torques, step, pushes)
     expected, target = _expected(prediction, bodies.names), target_of(prediction)
     unexpected = unexpected_meetings(prediction, met)
     ending, lost = assess_execution(scene, course.z[-1], target, tolerance, creep, unexpected)
@@ -240,10 +243,10 @@ def target_of(prediction: Result) -> Float[np.ndarray, "5"]:
 
 
 def run_schedule(
-    bodies: MujocoModel, scene: Scene, start, torques, timestep: float
+    bodies: MujocoModel, scene: Scene, start, torques, timestep: float, pushes: Sequence[Push] = ()
 ) -> tuple[ExecutedMotion, float, dict[str, float]]:
     """The course of `rollout`, how far contacts crept, and what links met, when first [s]."""
-    z, z_dot, forces, creep, met = rollout(bodies, start, torques)
+    z, z_dot, forces, creep, met = rollout(bodies, start, torques, pushes)
     times = np.arange(len(z)) * timestep
     return (
         ExecutedMotion(times, z, z_dot, forces[..., 0], forces[..., 1], touching_contacts_at(scene, bodies.names, z)),
@@ -252,7 +255,7 @@ def run_schedule(
     )
 
 
-def rollout(bodies: MujocoModel, start, torques: Float[np.ndarray, "steps 2"] | Motor):
+def rollout(bodies: MujocoModel, start, torques: Float[np.ndarray, "steps 2"] | Motor, pushes: Sequence[Push] = ()):
     """Step the model from rest at `start`: `z`, `z_dot` and forces `(c_n, c_t)`; row `k` is the state before step `k`.
 
     `torques` are those of each step, or what says them while the bodies move.
@@ -262,13 +265,14 @@ def rollout(bodies: MujocoModel, start, torques: Float[np.ndarray, "steps 2"] | 
     """
     data, step = mujoco.MjData(bodies.model), stepper(bodies)
     motor = torques if callable(torques) else _scheduled_motor(torques)
+    push = push_force(pushes, bodies.model.opt.timestep)
     z, z_dot, forces = [], [], []
     data.qpos[:] = start
     found, creep, met, last = np.zeros((len(bodies.names), 2)), 0.0, {}, np.zeros(2)
     while (torque := motor(len(z), data.qpos[3:])) is not None:
         z.append(data.qpos.copy())
         z_dot.append(data.qvel.copy())
-        found, wrong = step(bodies, data, torque, found)
+        found, wrong = step(bodies, data, torque, found, push(len(z) - 1))
         forces.append(found)
         last, creep = torque, creep + wrong * bodies.model.opt.timestep
         record_meetings(bodies, data, (len(z) - 1) * bodies.model.opt.timestep, met)
@@ -289,8 +293,9 @@ def stepper(bodies: MujocoModel) -> Callable:
     return advance if bodies.softness.friction == "coulomb" else _advance
 
 
-def _advance(bodies: MujocoModel, data: mujoco.MjData, torque, before):
+def _advance(bodies: MujocoModel, data: mujoco.MjData, torque, before, push=0.0):
     data.ctrl[:] = torque
+    data.qfrc_applied[:] = push
     mujoco.mj_step(bodies.model, data)  # its contacts are those of the state before the step
     forces = np.zeros_like(before)
     _read_forces(bodies, data, forces)

@@ -24,7 +24,7 @@ def record_meetings(bodies: MujocoModel, data: mujoco.MjData, time: float, met: 
     if data.nl:
         beyond = (data.qpos[3:] < bodies.model.jnt_range[3:, 0]) | (data.qpos[3:] > bodies.model.jnt_range[3:, 1])
         for finger in np.flatnonzero(beyond):
-            met.setdefault(range_name(finger), time)
+            met.setdefault(range_name(int(finger)), time)
 
 
 def unexpected_meetings(prediction: Result, met: Collection[str]) -> set[str]:
@@ -36,7 +36,7 @@ def unexpected_meetings(prediction: Result, met: Collection[str]) -> set[str]:
         return set()
     ends = np.array([phase.traced.end[3:] for phase in prediction.phases])
     reached = (np.abs(ends[..., None] - np.asarray(prediction.scene.hand.range)) < RANGE_TOL).any((0, 2))
-    return {*met} - {range_name(finger) for finger in np.flatnonzero(reached)}
+    return {*met} - {range_name(int(finger)) for finger in np.flatnonzero(reached)}
 
 
 def range_name(finger: int) -> str:

@@ -15,9 +15,9 @@ against the end of the perturbed object's own path from where it was laid.
 
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -46,6 +46,7 @@ from wholearm_jax.execution.executions import (
 )
 from wholearm_jax.execution.link_meetings import unexpected_meetings
 from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
+from wholearm_jax.execution.pushes import Push
 from wholearm_jax.feedback import Controller
 from wholearm_jax.model import (
     Arrival,
@@ -125,10 +126,42 @@ class TrialsResult:
         return f"{self.successes} of {len(self.runs)} perturbed executions succeed: {share:.1f} %, {span}; {own}"
 
 
+class Copy(NamedTuple):
+    """One execution of a plan: on `scene`, its object's start displaced in x, y and r phi [m], under `pushes`."""
+
+    scene: Scene
+    displacement: Float[np.ndarray, "3"]
+    pushes: tuple[Push, ...] = ()
+
+
 def run_trials(
     prediction: Result,
     count: int,
     amounts: Amounts,
+    *,
+    seed: int = 0,
+    tolerance: Tolerance = Tolerance(),
+    pushes: Sequence[Push] = (),
+    **settings: Any,
+) -> TrialsResult:
+    """Execute `count` perturbed copies of a plan, each under `pushes`; `settings` are those of `run_copies`.
+
+    Raises ValueError as `run_copies` and `require_objects` do, and for a `count` that is not positive.
+    """
+    require_positive(count=count)
+    require_wires(prediction)
+    require_objects(prediction.scene, amounts)
+    scenes = _draw_scenes(prediction.scene, amounts, seed, count)
+    displacements = _draw_displacements(prediction.scene, amounts, seed, count)
+    copies = [Copy(*drawn, tuple(pushes)) for drawn in zip(scenes, displacements, strict=True)]
+    return TrialsResult(
+        amounts, seed, tolerance, run_copies(prediction, copies, seed=seed, tolerance=tolerance, **settings)
+    )
+
+
+def run_copies(
+    prediction: Result,
+    copies: Sequence[Copy],
     *,
     seed: int = 0,
     timestep: float = 2e-4,
@@ -138,17 +171,15 @@ def run_trials(
     callback: Callable[[PerturbedRun], None] | None = None,
     controller: Controller | None = None,
     hardware: Hardware = Hardware(),
-) -> TrialsResult:
-    """Execute `count` perturbed copies of a plan in `workers` processes (default: one for each processor).
+) -> tuple[PerturbedRun, ...]:
+    """Execute copies of a plan in `workers` processes (default: one for each processor).
 
-    `callback` sees each as it is done, in their order. A `controller` measures and acts through `hardware`. Raises
-    ValueError as `require_wires` and `require_objects` do, and for numbers that are not positive.
+    `callback` sees each as it is done, in their order. A `controller` measures and acts through `hardware`, whose noise
+    `seed` plus the copy's number draws. Raises ValueError as `require_wires` does, and for a `timestep` that is not
+    positive.
     """
-    require_positive(count=count, timestep=timestep)
+    require_positive(timestep=timestep)
     require_wires(prediction)
-    require_objects(prediction.scene, amounts)
-    scenes = _draw_scenes(prediction.scene, amounts, seed, count)
-    displacements = _draw_displacements(prediction.scene, amounts, seed, count)
     begins, step = clock(prediction.scene, timestep)
     drives: Iterator = itertools.repeat(motor_torques(prediction.torque, begins, step))
     if controller is not None:
@@ -156,18 +187,21 @@ def run_trials(
         drives = (ControlledMotor(controller, hardware, step, seed + k) for k in itertools.count())
     nominal, target = start_of(prediction), target_of(prediction)
     laid = [
-        lay_in_hand(prediction, scene, start_near(scene, nominal, shift))
-        for scene, shift in zip(scenes, displacements, strict=True)
+        lay_in_hand(prediction, one.scene, start_near(one.scene, nominal, np.asarray(one.displacement)))
+        for one in copies
     ]
-    copies = ((build_mujoco_model(scene, step, softness), path.start) for scene, path in zip(scenes, laid, strict=True))
-    found = rollout_in_parallel(copies, drives, min(workers or os.cpu_count() or 1, count))
+    models = (
+        (build_mujoco_model(one.scene, step, softness), path.start) for one, path in zip(copies, laid, strict=True)
+    )
+    pushed = [one.pushes for one in copies]
+    found = rollout_in_parallel(models, drives, max(1, min(workers or os.cpu_count() or 1, len(copies))), pushed)
     runs = []
-    for scene, own, (end, creep, met) in zip(scenes, laid, found, strict=True):
+    for one, own, (end, creep, met) in zip(copies, laid, found, strict=True):
         targets, reached = (target, own.target), (end, creep, unexpected_meetings(prediction, met))
-        runs.append(_summary(prediction.scene, scene, targets, reached, tolerance))
+        runs.append(_summary(prediction.scene, one.scene, targets, reached, tolerance))
         if callback is not None:
             callback(runs[-1])
-    return TrialsResult(amounts, seed, tolerance, tuple(runs))
+    return tuple(runs)
 
 
 def require_objects(scene: Scene, amounts: Amounts) -> None:
@@ -239,16 +273,21 @@ def lay_in_hand(prediction: Result, scene: Scene, start) -> OwnPath:
 
 
 def rollout_in_parallel(
-    copies: Iterable[tuple[MujocoModel, Float[np.ndarray, "5"]]], drives: Iterable, workers: int
+    models: Iterable[tuple[MujocoModel, Float[np.ndarray, "5"]]],
+    drives: Iterable,
+    workers: int,
+    pushes: Iterable[Sequence[Push]] = itertools.repeat(()),
 ) -> Iterator[tuple[Float[np.ndarray, "5"], float, dict[str, float]]]:
-    """Where free bodies end, driven from rest at their starts, how far contacts crept, and what links met
-    (`execution.trace_phase_path`). `drives` are the torques of each, or its motor."""
-    each = (delayed(_end)(*copy, motor) for copy, motor in zip(copies, drives, strict=False))
+    """Yield where free bodies end, driven from rest at their starts, how far contacts crept, and what links met.
+
+    `drives` are the torques of each, or its motor; `pushes` act on each beside them.
+    """
+    each = (delayed(_end)(*model, motor, pushed) for model, motor, pushed in zip(models, drives, pushes, strict=False))
     return Parallel(n_jobs=workers, return_as="generator")(each)  # pyright: ignore[reportReturnType]
 
 
-def _end(bodies: MujocoModel, start, torques) -> tuple[Float[np.ndarray, "5"], float, dict[str, float]]:
-    z, _, _, creep, met = rollout(bodies, start, torques)
+def _end(bodies: MujocoModel, start, torques, pushes) -> tuple[Float[np.ndarray, "5"], float, dict[str, float]]:
+    z, _, _, creep, met = rollout(bodies, start, torques, pushes)
     return z[-1], creep, met
 
 

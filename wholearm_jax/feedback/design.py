@@ -20,6 +20,7 @@ from wholearm_jax.feedback.torque_choice import TorqueChoice, choose_torques
 from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule
 from wholearm_jax.phases import (
     TracedPhase,
+    ends_at_stop,
     formation_at_end,
     group_phases,
     require_motion,
@@ -27,7 +28,6 @@ from wholearm_jax.phases import (
     trace,
     trajectory,
 )
-from wholearm_jax.tracing import PathEnd
 
 RESERVE = 0.9  # fraction of the torque limits that the reference's torques and their corrections stay within
 PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
@@ -156,9 +156,9 @@ def _phase_law(
 ) -> PhaseLaw:
     """Put the law of one phase together."""
     gain = np.stack([np.interp(table.s, motion.s, choice.gain[:, j]) for j in range(2)], axis=1)
-    made = int(traced.path.end_reason) == PathEnd.CONTACT_MADE and phase.arrive is not Arrival.MOVING
+    stops = phase.arrive is not Arrival.MOVING and ends_at_stop(scenes[0], phase, traced)
     press = 0.0
-    if made:
+    if stops:
         closed = formation_at_end(scenes[0], phase, traced)
         press, gain_at_stop = choose_push(scenes, closed, np.asarray(traced.end), every, choice.torque[-1])
         gain[table.s > table.s[-1] - BEYOND] = gain_at_stop
@@ -175,7 +175,7 @@ def _phase_law(
         s_ref=motion.s,
         v_ref=motion.v,
         torque=choice.torque,
-        reach=BEYOND if made else 0.0,
+        reach=BEYOND if stops else 0.0,
         approach=APPROACH,
         press=press,
         margin=float(choice.margin.min()),

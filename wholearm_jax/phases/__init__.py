@@ -17,6 +17,7 @@ from wholearm_jax.phases.obstacles import describe_overlaps
 from wholearm_jax.phases.phase_ends import (
     configuration,
     describe_end,
+    ends_at_stop,
     final_configuration,
     formation_at_end,
     statics_at_start,

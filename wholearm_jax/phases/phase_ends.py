@@ -14,12 +14,15 @@ from wholearm_jax.model import (
     ContactFormation,
     Phase,
     Scene,
+    contact_kinematics,
     contact_name,
+    rigid_body,
+    scaled_mechanics,
 )
 from wholearm_jax.phases.obstacles import describe_obstacle
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.simulation import Motion
-from wholearm_jax.tracing import PathEnd
+from wholearm_jax.tracing import PathEnd, hold_same_tip
 
 
 @jax.jit
@@ -63,6 +66,20 @@ def formation_at_end(scene: Scene, phase: Phase, traced: TracedPhase) -> Contact
     held = phase.formation
     rows = zip((held.link, held.kind, held.feature, held.tangential), (link, kind, feature, False), strict=True)
     return ContactFormation(*(jnp.append(column, value) for column, value in rows))
+
+
+def ends_at_stop(scene: Scene, phase: Phase, traced: TracedPhase) -> bool:
+    """Return whether a new contact stops the object at the end of a phase's path.
+
+    None does where the path ends because a vertex and a fingertip take over from one another: there the object can go
+    on under the new contact.
+    """
+    if int(traced.path.end_reason) != PathEnd.CONTACT_MADE:
+        return False
+    closed = formation_at_end(scene, phase, traced)
+    mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, closed)
+    at = contact_kinematics(mechanics.contacts, jnp.asarray(traced.end) / mechanics.configuration_unit)
+    return not bool(hold_same_tip(mechanics.contacts, at, mechanics.contacts, at)[-1].any())
 
 
 def describe_end(scene: Scene, phase: Phase, traced: TracedPhase) -> str:

@@ -80,13 +80,16 @@ def plan_with_hand(
     edge = edge_on_palm(scene.object, np.asarray(scene.start))
     tried: dict[tuple[float, float], tuple[HandTrial, Scene, PlanningResult | None]] = {}
 
-    def attempt(every: Iterable[tuple[float, float]], effort: int) -> None:
-        for proportions in every:
-            if proportions in tried and (tried[proportions][0].bound != -np.inf):
-                continue  # has its plan, or does not close on the object
+    spent: dict[tuple[float, float], float] = {}  # the effort on a hand; no end of it where more cannot help
+
+    def attempt(lengths: Iterable[float], joints: Iterable[float], effort: int) -> None:
+        for proportions in itertools.product(lengths, joints):
+            if spent.get(proportions, 0) >= effort:
+                continue
             changed = _start_in(scene, edge, *proportions)
             found = None if changed is None else plan(changed, goal, max_nodes=effort, **options)
             bound = np.nan if found is None else found.plans[0].bound if found.found else -np.inf
+            spent[proportions] = effort if bound == -np.inf else np.inf
             tried[proportions] = HandTrial(*proportions, float(bound)), changed or scene, found
             if callback is not None:
                 callback(len(tried), max((one.bound for one, _, _ in tried.values() if one.bound > 0), default=0.0))
@@ -94,7 +97,7 @@ def plan_with_hand(
     ranges = [length, joint]
     effort = 0
     for effort in EFFORTS if max_nodes is None else (max_nodes,):
-        attempt(itertools.product(*(_values(*limits, grid) for limits in ranges)), effort)
+        attempt(_values(*length, grid), _values(*joint, grid), effort)
         if _best(tried) is not None:
             break
     spacing = [(high - low) / max(grid - 1, 1) for low, high in ranges]
@@ -103,11 +106,11 @@ def plan_with_hand(
         if best is None:
             break
         spacing = [step / 2 for step in spacing]
-        near = [
+        lengths, joints = (
             _values(max(centre - step, low), min(centre + step, high), 3)
             for centre, step, (low, high) in zip(best, spacing, ranges, strict=True)
-        ]
-        attempt((proportions for proportions in itertools.product(*near) if proportions not in tried), effort)
+        )
+        attempt(lengths, joints, effort)
     best = _best(tried)
     trials = tuple(trial for trial, _, _ in tried.values())
     return HandSearchResult(None, scene, None, trials) if best is None else HandSearchResult(*tried[best], trials)

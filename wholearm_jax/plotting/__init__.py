@@ -8,6 +8,7 @@ _MODULES = {
     "PAGE": "style",
     "PAPER": "style",
     "animate": "execution_figures",
+    "plot_disturbance_map": "disturbance_figures",
     "plot_ensemble": "ensemble_figures",
     "plot_execution": "execution_figures",
     "plot_execution_strip": "execution_figures",

@@ -1,0 +1,111 @@
+"""Pushes during an execution, and maps of what a law survives: closed forms, and one execution at a time."""
+
+from pathlib import Path
+
+import equinox as eqx
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.execution import (
+    ExecutionOutcome,
+    build_mujoco_model,
+    execute,
+    friction_map,
+    push,
+    push_map,
+    start_map,
+)
+from wholearm_jax.execution.executions import run_schedule
+from wholearm_jax.execution.mujoco_model import ContactCompliance
+from wholearm_jax.model import rigid_body
+from wholearm_jax.plotting import plot_disturbance_map
+
+STEP = 1e-3
+TORQUE = Path(__file__).parents[1] / "data" / "heptagon_torque.csv"
+
+
+@pytest.fixture(scope="module")
+def prediction(scene):
+    return wa.simulate(scene, wa.quasistatic(scene))
+
+
+@pytest.mark.parametrize("duration", [0.1 * STEP, 2.5 * STEP, 0.02])
+@pytest.mark.parametrize("friction", ["coulomb", "convex"])
+def test_a_push_gives_its_whole_impulse(scene, duration, friction):
+    """Far from everything a body's momentum changes by the impulse, however long it lasts or a step is."""
+    floating = eqx.tree_at(lambda s: (s.hand.dry, s.hand.viscous), scene, (np.zeros(2), np.zeros(2)))
+    bodies = build_mujoco_model(floating, STEP, ContactCompliance(friction=friction))
+    start = np.array([0.0, 1.0, 0.3, 1.0, 2.0])
+    impulse = {"x": 0.02, "y": -0.01, "phi": 1e-4, "theta1": 2e-3}
+    pushes = [push(0.01, duration=duration, **impulse), push(0.015, x=0.01)]
+    count = 60
+    course, _, _ = run_schedule(bodies, floating, start, np.zeros((count, 2)), STEP, pushes)
+    still, _, _ = run_schedule(bodies, floating, start, np.zeros((count, 2)), STEP)
+    body, link = rigid_body(floating.object), np.asarray(floating.hand.inertia)[0]
+    expected = [0.03 / body.mass, -0.01 / body.mass, 1e-4 / body.inertia, 2e-3 / link, 0.0]
+    np.testing.assert_allclose(course.z_dot[-1] - still.z_dot[-1], expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(course.z_dot[:11], still.z_dot[:11])  # row 11 is the state after its first step
+
+
+def test_the_law_brings_back_what_was_pushed_and_says_what_it_lost(prediction, controller):
+    """A push by a tenth of what throws it out of the hand leaves the object where it ought to be."""
+    survived = execute(prediction, controller=controller, pushes=[push(0.6, phi=2e-3)])
+    assert survived.ending is ExecutionOutcome.OK
+    thrown = execute(prediction, controller=controller, pushes=[push(0.6, phi=0.02)])
+    assert thrown.ending is not ExecutionOutcome.OK
+
+
+def test_a_map_is_made_of_single_executions(prediction, controller):
+    sizes, times = (2e-3, 0.02), (0.3, 0.6)
+    found = push_map(prediction, "phi", sizes, times, controller=controller, workers=2)
+    assert (found.kind, found.columns) == ("push about phi [N m s]", times)
+    for i, size in enumerate(sizes):
+        for j, time in enumerate(times):
+            alone = execute(prediction, controller=controller, pushes=[push(time, phi=size)], seed=2 * i + j)
+            assert found.endings[i][j] == alone.ending.value
+            run = found.runs[2 * i + j]
+            assert run.own_position_error == pytest.approx(alone.position_error, abs=1e-6)
+    assert found.succeeds[0].all()
+    assert not found.succeeds[1].all()
+
+
+def test_maps_of_friction_and_start_change_one_thing_a_column(prediction, controller):
+    rougher = friction_map(prediction, (1.1,), controller=controller, workers=2)
+    assert rougher.columns == ("palm", "finger1", "finger2")
+    assert rougher.succeeds.all()
+    np.testing.assert_allclose([run.friction for run in rougher.runs], 1.0 + 0.1 * np.eye(3))
+    moved = start_map(prediction, (1e-3,), controller=controller, workers=2)
+    assert moved.columns == ("x", "y", "phi")
+    assert moved.succeeds.shape == (1, 3)
+
+
+def test_the_figure_has_a_mark_for_every_execution(prediction, controller):
+    found = push_map(prediction, "phi", (2e-3, 0.02), (0.6,), controller=controller, workers=2)
+    ax = plot_disturbance_map(found)
+    assert sum(len(marks.get_offsets()) for marks in ax.collections) == 2
+    assert ax.get_xlabel() == "begins at [s]"
+    plt.close(ax.figure)
+
+
+@pytest.mark.parametrize(
+    ("time", "more", "says"),
+    [
+        (0.1, {"z": 1.0}, "z: the coordinates are x, y, phi"),
+        (0.1, {}, "nothing"),
+        (-0.1, {"x": 1.0}, "must not be negative"),
+        (0.1, {"x": np.inf}, "finite"),
+        (0.1, {"x": 1.0, "duration": 0.0}, "duration"),
+    ],
+)
+def test_pushes_that_cannot_be_are_refused(time, more, says):
+    with pytest.raises(ValueError, match=says):
+        push(time, **more)
+
+
+@pytest.mark.parametrize("text", ["0.1", "x@0.1", "x=0.1", "z=0.1@0.2", "x=a@0.1", "x=0.1@-1"])
+def test_the_command_refuses_them_in_one_line(text, wholearm):
+    code, out, err = wholearm("execute", "heptagon", "--torque", TORQUE, "--push", text)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert f"--push {text}: write COORDINATE=IMPULSE@TIME" in err
