@@ -95,16 +95,31 @@ def test_where_the_bound_is_negative_no_more_time_is_advised():
     assert "optimise" not in phase.remedy
 
 
-def test_before_an_obstacle_a_phase_may_end():
-    scene = wa.load(CASES / "finger_below_palm.toml")
+def test_before_an_obstacle_a_phase_may_end(heptagon):
+    """Half-way through the slide finger 1's range ends: the advice is where to end the slide instead."""
+    traced = wa.trace(heptagon)
+    data = to_dict(heptagon)
+    halfway = float((traced[0].begin[3] + traced[0].end[3]) / 2)
+    data["hand"]["finger1"]["range"] = sorted(
+        [halfway, float(traced[0].begin[3] + 0.1 * (traced[0].begin[3] - halfway))]
+    )
+    scene = wa.parse(data)
     result = wa.simulate(scene, wa.torque_schedule([0.0, 10.0], [[0.1, -0.1], [0.1, -0.1]]))
-    coordinate, value = re.search(r"until = \{(\w+) = ([-\d.e]+)\}", result.phases[1].remedy).groups()
-    data = to_dict(scene)
-    data["phase"][1]["until"] = {coordinate: float(value)}
-    assert bool(wa.trace(scene)[1].dynamics.ends_at_obstacle)
-    before = wa.trace(wa.parse(data))[1]
+    coordinate, value = re.search(r"until = \{(\w+) = ([-\d.e]+)\}", result.phases[0].remedy).groups()
+    assert bool(result.phases[0].traced.dynamics.ends_at_obstacle)
+    data["phase"][0]["until"] = {coordinate: float(value)}
+    before = wa.trace(wa.parse(data))[0]
     assert int(before.dynamics.status) == wa.Status.OK
     assert not bool(before.dynamics.ends_at_obstacle)
+
+
+def test_a_refused_start_also_names_the_obstacle_further_on():
+    scene = wa.load(CASES / "finger_below_palm.toml")
+    result = wa.simulate(scene, wa.torque_schedule([0.0, 10.0], [[0.1, -0.1], [0.1, -0.1]]))
+    message = result.phases[1].message
+    assert message.count("finger2:e0 and finger2:e1 hold a tip at a vertex") == 1
+    assert "finger2:e0 and finger2:e0" not in message
+    assert "further on finger1 reaches its range at 0 deg, level with the palm" in message
 
 
 def test_each_cause_has_its_own_words(too_fast):

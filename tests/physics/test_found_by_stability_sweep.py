@@ -138,7 +138,7 @@ def test_derivatives_pass_from_chart_to_chart():
         assert float(slope[k]) == pytest.approx(numeric, rel=1e-6, abs=1e-9)
 
 
-def test_a_wire_that_meets_another_is_singular():
+def test_a_tip_that_a_vertex_and_an_edge_hold_where_they_meet_is_refused():
     """A finger's edge flush with the object, held by a vertex and the tip: where the two meet, they are one contact."""
     flush = scene(
         [[0.5708, 0.3954], [-0.9376, 0.2421], [-0.6901, -0.3374], [0.9554, -0.2954]],
@@ -149,7 +149,7 @@ def test_a_wire_that_meets_another_is_singular():
         length=0.881,
         offset=(0.05339, 0.0),
     )
-    assert int(wa.trace(flush)[0].dynamics.status) == wa.Status.SINGULAR
+    assert int(wa.trace(flush)[0].dynamics.status) == wa.Status.LEFT_FORMATION
 
 
 def test_wedging_on_the_way_back_does_not_spoil_the_table():
@@ -275,6 +275,7 @@ def test_what_passes_and_comes_back_within_a_step_is_met_on_its_way_down(side):
         is_terminal=jnp.array([True, True]),
         two_sided=jnp.array([True, False]),
         half_width=jnp.zeros(2),
+        may_part=jnp.array([False, False]),
     )
     step, inside = 2e-3, jnp.array([0.5, 0.0])
     gap = np.polynomial.Polynomial.fromroots([0.3 * step, 0.999999 * step])

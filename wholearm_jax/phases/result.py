@@ -16,6 +16,7 @@ from wholearm_jax.phases.phase_ends import configuration, describe_end
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.phases.standing_fingers import find_standing_defect, hold_during_regrasp
+from wholearm_jax.tracing import PathEnd
 
 SLIP_TOL = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
 REFUSED_STARTS = (Status.LEFT_FORMATION, Status.OBSTACLE)  # statuses of a path that mean that it cannot begin
@@ -161,7 +162,9 @@ def path_remedy(phase: Phase, traced: TracedPhase) -> str | None:
 def _detail(scene: Scene, phase: Phase, traced: TracedPhase, status: Status) -> str | None:
     """Name what is in the way of a phase."""
     if int(traced.path.status) in REFUSED_STARTS:
-        return describe_refused_start(scene, phase, traced.begin)
+        refused = describe_refused_start(scene, phase, traced.begin)
+        ends_at_obstacle = refused and int(traced.path.end_reason) == PathEnd.OBSTACLE
+        return f"{refused}; further on {describe_end(scene, phase, traced)}" if ends_at_obstacle else refused
     return describe_end(scene, phase, traced) if status is Status.OBSTACLE else None
 
 

@@ -36,7 +36,8 @@ def hold_same_tip(
     (ex, ey), (other_ex, other_ey) = contacts.edge, others.edge
     turn = of_each_two(jnp.multiply, ex, other_ey) - of_each_two(jnp.multiply, ey, other_ex)
     comes_after = of_each_two(jnp.less, at.along, at_others.along)
-    turns_outward = ~contacts.on_link[:, None] & ~others.on_link & (jnp.where(comes_after, -turn, turn) > 0)
+    # Above rounding: with itself an edge turns nowhere.
+    turns_outward = ~contacts.on_link[:, None] & ~others.on_link & (jnp.where(comes_after, -turn, turn) > CORNER_TOL)
     both_gaps = of_each_two(jnp.logical_and, _hold_gap(contacts), _hold_gap(others))
     return both_gaps & one_finger & (distance < CORNER_TOL) & (on_link | turns_outward)
 
