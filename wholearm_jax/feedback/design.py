@@ -28,6 +28,7 @@ from wholearm_jax.phases import (
     trace,
     trajectory,
 )
+from wholearm_jax.tracing import PathEnd
 
 RESERVE = 0.9  # fraction of the torque limits that the reference's torques and their corrections stay within
 PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
@@ -35,6 +36,9 @@ BEYOND = 0.06  # how far the reference goes on beyond the path's end, to meet th
 APPROACH = 0.15  # speed with which [rad/s]
 FELT = (0.05, 0.03)  # speed [rad/s] below which an object stands, and for how long [s]
 LONGEST_DELAY = 1.0  # longest time beyond a phase's duration [s]
+UNSURE = (
+    0.005  # distance from a corner within which measured angles do not tell its sides: 3 counts of 4096 a turn [rad]
+)
 
 
 def feedback(
@@ -84,11 +88,12 @@ def feedback(
     traces = [tuple(phase.traced for phase in result.phases), *(trace(other) for other in scenes[1:])]
     tables = [tabulate_path(path.dynamics) for path in traces[0]]
     terms = [[path_terms(paths[k].dynamics, table) for paths in traces] for k, table in enumerate(tables)]
+    either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
     limit = RESERVE * np.asarray(scene.hand.torque_limit)
     laws = []
     for group in group_phases(scene):
         options = _motions(scene, group, tables, trajectory(result), own_motion)
-        choices = [[_choose(terms[k], tables[k], limit, m) for k, m in zip(group, o, strict=True)] for o in options]
+        choices = [[_choose(either[k], tables[k], limit, m) for k, m in zip(group, o, strict=True)] for o in options]
         best = int(np.argmax([min(float(c.margin.min()) for c in row) for row in choices]))
         for k, motion, choice in zip(group, options[best], choices[best], strict=True):
             laws.append(_phase_law(scenes, scene.phases[k], tables[k], terms[k], motion, choice, traces[0][k]))
@@ -123,10 +128,47 @@ def _motions(scene: Scene, group, tables, courses, own_motion: bool) -> list[lis
     return options
 
 
+def _hand_overs(scene: Scene, traced: tuple[TracedPhase, ...]) -> list[bool]:
+    """Say of each two phases whether a vertex and a fingertip take over from one another between them, at rest."""
+    return [
+        phase.arrive is not Arrival.MOVING
+        and int(path.path.end_reason) == PathEnd.CONTACT_MADE
+        and not ends_at_stop(scene, phase, path)
+        for phase, path in zip(scene.phases[:-1], traced[:-1], strict=True)
+    ]
+
+
+def _with_either_formation(
+    tables: list[PathTable], terms: list[list[PathTerms]], hand_overs: list[bool]
+) -> list[list[PathTerms]]:
+    """Add, next to each hand-over, the objects as the other formation holds them.
+
+    Measured angles do not tell there which of the two holds the object: the law has to move it under both.
+    """
+    found = [[*each] for each in terms]
+    for k in np.flatnonzero(hand_overs):
+        near_end = tables[k].s > tables[k].s[-1] - UNSURE
+        near_start = tables[k + 1].s < UNSURE
+        found[k] += [_replaced(own, near_end, other, 0) for own, other in zip(*terms[k : k + 2], strict=True)]
+        found[k + 1] += [_replaced(own, near_start, other, -1) for other, own in zip(*terms[k : k + 2], strict=True)]
+    return found
+
+
+def _replaced(own: PathTerms, rows, other: PathTerms, at: int) -> PathTerms:
+    """Replace some rows of a path's terms by those at one place of another path."""
+    facets = max(own.slack.shape[1], other.slack.shape[1])
+    slack, there = (np.take(each.slack, np.arange(facets), axis=1, mode="clip") for each in (own, other))
+    return PathTerms(
+        np.where(rows[:, None], other.acceleration[at], own.acceleration),
+        np.where(rows[:, None, None], there[at], slack),
+    )
+
+
 def _choose(every: list[PathTerms], table: PathTable, limit, motion: ReferenceMotion) -> TorqueChoice:
     """Choose torques and gains at the nodes next to a motion's places."""
     nodes = np.abs(motion.s[:, None] - table.s).argmin(1)
-    at = [PathTerms(terms.acceleration[nodes], terms.slack[nodes]) for terms in every]
+    facets = np.arange(max(terms.slack.shape[1] for terms in every))
+    at = [PathTerms(t.acceleration[nodes], np.take(t.slack[nodes], facets, axis=1, mode="clip")) for t in every]
     return choose_torques(at, limit, motion.v, motion.a)
 
 
