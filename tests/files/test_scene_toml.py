@@ -88,7 +88,7 @@ def assert_same(one, other):
 
 
 def test_bundled_scenes():
-    assert bundled() == ("flight", "heptagon", "hexagon", "passage", "tipping")
+    assert bundled() == ("box", "flight", "heptagon", "hexagon", "passage", "tipping")
 
 
 @pytest.mark.parametrize("name", ["heptagon", "hexagon"])
@@ -343,7 +343,7 @@ def test_missing_file_names_the_nearest_bundled_scene():
 
 def test_missing_file_unlike_any_lists_the_bundled_scenes(tmp_path):
     path = tmp_path / "nothing" / "such.toml"
-    assert refused(path) == f"{path}: no such file; bundled scenes: flight, heptagon, hexagon, passage, tipping"
+    assert refused(path) == f"{path}: no such file; bundled scenes: box, flight, heptagon, hexagon, passage, tipping"
 
 
 def test_folder(tmp_path):

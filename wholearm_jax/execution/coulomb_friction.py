@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from wholearm_jax.execution.mujoco_model import MujocoModel
+from wholearm_jax.execution.mujoco_model import MujocoModel, choose_edges
 
 EXACT, ROUNDS = 1e-6, 100  # when to stop: share of the largest friction by which forces still change; rounds at most
 
@@ -37,6 +37,7 @@ def advance(
     several contacts is not determined), and much where no forces agree with that law, as there need not be any if
     friction is large.
     """
+    choose_edges(bodies, data)
     mujoco.mj_step1(bodies.model, data)
     data.ctrl[:] = torque
     pair, address, rows = _touching(bodies, data)

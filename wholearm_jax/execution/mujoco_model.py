@@ -18,6 +18,10 @@ The links are bodies among themselves, too: fingertips and joints are dots again
 on which they start, and fingertips against the palm, without friction; ranges are joint limits. Layered fingers do not
 meet.
 
+A fingertip touches an edge only where its finger comes from the edge's outer side (`choose_edges`, before every step):
+from the inner side the finger meets an end of the edge first, and a tip that slips past that vertex, a little inside
+it, would catch on the edge.
+
 A pair thus touches at one point of the plane. If `a_free` is the acceleration of the gap `C` without the contact, then
 
     C_ddot = (1 - d) a_free - d (b C_dot + k C),    b = 2 / (d t_c),  k = 1 / (d t_c^2)        (`ContactCompliance`)
@@ -43,6 +47,7 @@ POINT_RADIUS = 1e-5  # radius of a dot [object radii]: far above rounding, its l
 PAIR_DISTANCE = (
     1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
 )
+NEVER = 1e9  # how far below its margin a contact that is left out would act
 HALF_SPACE_DEPTH = 0.2  # slabs, and all shapes in depth [object radii]
 
 
@@ -76,6 +81,16 @@ CONVEX = ContactCompliance(impedance=0.5, friction="convex")
 
 
 @dataclass(frozen=True)
+class EdgePairs:
+    """Pairs of a fingertip and an edge: rows of MuJoCo's pairs, fingers (0 or 1), and the edges' outward normals."""
+
+    row: Int[np.ndarray, "edge_pairs"]
+    finger: Int[np.ndarray, "edge_pairs"]
+    normal: Float[np.ndarray, "edge_pairs 2"]  # in the object's frame
+    margin: float  # gap at which they act [m]
+
+
+@dataclass(frozen=True)
 class MujocoModel:
     """A compiled model, the names of its contacts, and what Coulomb's friction needs of both.
 
@@ -87,6 +102,7 @@ class MujocoModel:
 
     model: mujoco.MjModel
     names: tuple[str, ...]
+    edges: EdgePairs
     link_meetings: tuple[str, ...]
     pair: Int[np.ndarray, "geoms geoms"]
     toward: Int[np.ndarray, "rows"]
@@ -125,6 +141,7 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
     return MujocoModel(
         model=model,
         names=tuple(rows),
+        edges=_edge_pairs(model, tuple(rows), solid, PAIR_DISTANCE * size),
         link_meetings=link_meetings,
         pair=pair,
         toward=toward,
@@ -134,6 +151,25 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
         mobility=1 / inertia,
         softness=softness,
         xml=spec.to_xml(),
+    )
+
+
+def _edge_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid, margin: float) -> EdgePairs:
+    corners = solid.vertices[: solid.count]
+    along = np.roll(corners, -1, 0) - corners
+    parsed = [(name, *parse_contact(name)[:3]) for name in names]
+    found = [(model.pair(name).id, link - 1, feature) for name, link, kind, feature in parsed if kind == EDGE]
+    row, finger, feature = np.array(found).T
+    return EdgePairs(row, finger, np.stack([along[feature, 1], -along[feature, 0]], axis=1), margin)
+
+
+def choose_edges(bodies: MujocoModel, data: mujoco.MjData) -> None:
+    """Leave out, for the next step, fingertips against edges from whose inner side their fingers come."""
+    _, _, phi, *angles = data.qpos
+    normal, way = bodies.edges.normal, np.array(angles)[bodies.edges.finger] - phi  # from joint to tip
+    from_outside = normal[:, 0] * np.cos(way) + normal[:, 1] * np.sin(way) <= 0
+    bodies.model.pair_margin[bodies.edges.row] = np.where(
+        from_outside, bodies.edges.margin, -NEVER * bodies.edges.margin
     )
 
 

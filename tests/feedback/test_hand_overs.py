@@ -1,0 +1,69 @@
+"""Laws where a vertex and a fingertip take over from one another: nothing stops the object there."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.execution import IDEAL
+from wholearm_jax.execution.executions import execute
+from wholearm_jax.execution.mujoco_model import build_mujoco_model, choose_edges
+from wholearm_jax.feedback import feedback
+from wholearm_jax.feedback.path_table import path_terms, tabulate_path
+from wholearm_jax.phases import ends_at_stop
+
+
+@pytest.fixture(scope="module")
+def box():
+    scene = wa.load("box")
+    return wa.simulate(scene, wa.quasistatic(scene))
+
+
+@pytest.fixture(scope="module")
+def law(box):
+    return feedback(box.scene, box.torque, friction=0.1)
+
+
+def test_all_phases_but_the_first_end_at_a_stop(box, law):
+    stops = [ends_at_stop(box.scene, phase, at.traced) for phase, at in zip(box.scene.phases, box.phases, strict=True)]
+    assert stops == [False, True, True]
+    assert [phase.reach > 0 for phase in law.phases] == stops
+    assert min(phase.margin for phase in law.phases) > 0
+
+
+def test_torques_at_a_hand_over_suit_both_formations(box, law):
+    """Of the two torques there, neither accelerates the object much under the other formation, nor loses a contact."""
+    paths = [phase.traced.dynamics for phase in box.phases[:2]]
+    before, after = (path_terms(dynamics, tabulate_path(dynamics)) for dynamics in paths)
+    for torque in (law.phases[0].torque[-1], law.phases[1].torque[0]):
+        for terms, row in ((before, -1), (after, 0)):
+            assert abs(terms.acceleration[row, 0] + terms.acceleration[row, 3:] @ torque) < 20.0
+            assert (terms.slack[row, :, 0] + terms.slack[row, :, 3:] @ torque).min() > 0
+
+
+def test_a_hand_without_noise_turns_the_box(box, law):
+    done = execute(box, timestep=2e-4, controller=law, hardware=IDEAL)
+    assert done.ending.value == "ok"
+    assert done.position_error < 5e-4
+    assert abs(done.angle_error) < 0.01
+
+
+def test_a_fingertip_meets_an_edge_from_its_outer_side_alone(box):
+    """At the corner, a little inside the box, both edges would hold the tip, whose finger comes from one side."""
+    bodies = build_mujoco_model(box.scene, 2e-4)
+    data = mujoco.MjData(bodies.model)
+    corner = np.asarray(box.phases[0].traced.end)
+
+    def touching(deeper, filtered):
+        data.qpos[:] = corner + np.array([0, 0, 0, 0, deeper])
+        bodies.model.pair_margin[bodies.edges.row] = bodies.edges.margin
+        if filtered:
+            choose_edges(bodies, data)
+        mujoco.mj_step1(bodies.model, data)
+        acting = data.contact.geom[data.contact.efc_address >= 0]
+        return {bodies.names[bodies.pair[a, b]] for a, b in acting if bodies.pair[a, b] < len(bodies.names)}
+
+    deeper = min((1e-6, -1e-6), key=lambda d: len({"finger2:e0", "finger2:e3"} - touching(d, filtered=False)))
+    assert {"finger2:e0", "finger2:e3"} <= touching(deeper, filtered=False)
+    assert "finger2:e0" in touching(deeper, filtered=True)
+    assert "finger2:e3" not in touching(deeper, filtered=True)
