@@ -46,6 +46,13 @@ def test_a_hand_without_noise_turns_the_box(box, law):
     assert done.ending.value == "ok"
     assert done.position_error < 5e-4
     assert abs(done.angle_error) < 0.01
+    assert len(done.events) >= 6
+    for event in done.events:
+        assert event.executed == pytest.approx(event.predicted, abs=0.05), event
+    on_the_way = (done.expected.time > 1.3) & (done.expected.time < 1.9)
+    column = done.names.index("finger2:e0")
+    forces = done.force("finger2:e0", done.expected.time[on_the_way])
+    np.testing.assert_allclose(forces, done.expected.cn[on_the_way, column], rtol=0.05)
 
 
 def test_a_fingertip_meets_an_edge_from_its_outer_side_alone(box):

@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -90,7 +90,10 @@ def execute(
     settings |= {"pushes": pushes}
     execution = rollout(prediction, seed=seed, **settings)
     trials = _run_trials(prediction, perturb, amounts, seed=seed, **settings) if perturb else None
-    more = {"torque": str(torque)} if law is None else {"controller": str(controller), "hardware": hardware._asdict()}
+    more: dict[str, Any] = {"torque": str(torque)}
+    if law is not None:
+        least = {"least_force": min(phase.margin for phase in law.phases)}
+        more = {"prediction": least, "controller": str(controller), "hardware": hardware._asdict()}
     more |= {"pushes": [dict(one._asdict(), impulse=one.impulse.tolist()) for one in pushes]} if pushes else {}
     content = execution_summary(execution, trials, **more)
     ok = execution.ending is ExecutionOutcome.OK
@@ -107,7 +110,7 @@ def execute(
 def _predict(name: str, scene, torque: Path | None, controller: Path | None):
     """Return the prediction to compare with, and the controller.
 
-    That of a controller is the plan under the quasi-static torques: where the paths begin and end is the same for all.
+    That of a controller is the plan under the quasi-static torques, of which the paths alone count.
     """
     from wholearm_jax.files import read_torque
     from wholearm_jax.optimisation import quasistatic

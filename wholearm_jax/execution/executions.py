@@ -32,7 +32,7 @@ from wholearm_jax.execution.coulomb_friction import advance
 from wholearm_jax.execution.link_meetings import record_meetings, unexpected_meetings
 from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model, choose_edges
 from wholearm_jax.execution.pushes import Push, push_force
-from wholearm_jax.feedback import Controller
+from wholearm_jax.feedback import Controller, planned_motion
 from wholearm_jax.model import (
     Arrival,
     ContactFormation,
@@ -46,7 +46,7 @@ from wholearm_jax.model import (
     feature_pair,
     rigid_body,
 )
-from wholearm_jax.phases import Result, target_configuration, trajectory
+from wholearm_jax.phases import Result, Trajectory, target_configuration, trajectory
 
 TOUCH = 1e-3  # gap below which a contact counts as touching [object radii]
 SAMPLES = 2001  # of the prediction, a phase
@@ -96,11 +96,11 @@ class ExecutedMotion(NamedTuple):
 class Execution:
     """An executed plan beside its prediction.
 
-    `course` is what happened, at every step; `expected` what was predicted (NaN: friction holds the object at rest, or
-    the prediction ended). Their contacts are `names`, all pairs that may touch; `planned` are those of the phases,
-    which do not say here whether they should roll. `link_contacts` are what links met, and when first [s]. `creep` is
-    how far contacts slipped against Coulomb's law, at most [m]: an execution that crept farther than its
-    tolerance diverged.
+    `course` is what happened, at every step; `expected` what was predicted, or a law's reference (NaN: friction holds
+    the object at rest, or the prediction ended). Their contacts are `names`, all pairs that may touch; `planned` are
+    those of the phases, which do not say here whether they should roll. `link_contacts` are what links met, and when
+    first [s]. `creep` is how far contacts slipped against Coulomb's law, at most [m]: an execution that crept farther
+    than its tolerance diverged.
     """
 
     prediction: Result
@@ -180,7 +180,8 @@ def execute(
         torques = ControlledMotor(controller, hardware, step, seed)
     bodies = build_mujoco_model(scene, step, softness)
     course, creep, met = run_schedule(bodies, scene, start_of(prediction), torques, step, pushes)
-    expected, target = _expected(prediction, bodies.names), target_of(prediction)
+    courses = trajectory(prediction, SAMPLES) if controller is None else planned_motion(controller, prediction)
+    expected, target = _expected(prediction, bodies.names, courses), target_of(prediction)
     unexpected = unexpected_meetings(prediction, met)
     ending, lost = assess_execution(scene, course.z[-1], target, tolerance, creep, unexpected)
     return Execution(
@@ -352,11 +353,11 @@ def assess_execution(
     return (ExecutionOutcome.CONTACT_LOST if lost else ExecutionOutcome.OK if near else ExecutionOutcome.ASTRAY), lost
 
 
-def _expected(prediction: Result, names: tuple[str, ...]) -> ExecutedMotion:
-    """The prediction as a course over all `names`."""
+def _expected(prediction: Result, names: tuple[str, ...], courses: tuple[Trajectory, ...]) -> ExecutedMotion:
+    """What the prediction, or a law's reference, has phase by phase, as one course over all `names`."""
     phases = []
-    for phase, at in zip(prediction.phases, trajectory(prediction, SAMPLES), strict=False):
-        cn, ct = np.zeros((2, SAMPLES, len(names)))
+    for phase, at in zip(prediction.phases, courses, strict=False):
+        cn, ct = np.zeros((2, len(at.time), len(names)))
         columns = [names.index(feature_pair(name)) for name in phase.contacts]
         cn[:, columns], ct[:, columns] = at.cn[:, : len(columns)], at.ct[:, : len(columns)]
         time, z, z_dot = (np.asarray(a) for a in (at.time, at.z, at.z_dot))
