@@ -122,13 +122,13 @@ def test_a_law_is_written_only_where_it_holds_the_whole_set(least, code, wholear
     given = ("optimise", "heptagon", "--feedback", "--robust", "friction=10%", "--knots", "11", "--out", tmp_path)
     status, _, err = wholearm(*given)
     assert status == code
-    assert asked == [{"friction": 0.1, "mass": 0.0}]
+    assert asked == [{"friction": 0.1, "mass": 0.0, "shape": None}]
     assert (tmp_path / "controller.json").exists() == (code == 0)
     assert (tmp_path / "torque.csv").exists()
     assert ("would open" in err) == (code == 1)
 
 
 def test_sets_that_a_law_does_not_know_are_refused(wholearm, tmp_path):
-    status, _, err = wholearm("optimise", "heptagon", "--feedback", "--robust", "vertices=0.001", "--out", tmp_path)
+    status, _, err = wholearm("optimise", "heptagon", "--feedback", "--robust", "gravity=10%", "--out", tmp_path)
     assert (status, len(err.splitlines())) == (2, 1)
-    assert "--robust knows friction=20% and mass=10%" in err
+    assert "--robust knows friction=20%, mass=10% and vertices=0.0005" in err

@@ -25,7 +25,7 @@ class Law:
         e = project(p, angles, predicted) - predicted
         self.s = predicted + (1 - r**2) * e
         self.v += (1 - r) ** 2 * e / h if h > 0 else 0.0
-        self.still = self.still + h if abs(self.v) < c["felt"][0] else 0.0
+        self.still = self.still + h if self.pressed and abs(self.v) < c["felt"][0] else 0.0
         # Change the phase.
         u, length, duration = t - self.t0, p["s"][-1], p["time"][-1]
         stopped = u >= duration and (p["reach"] == 0 or (self.pressed and self.still >= c["felt"][1]))

@@ -93,11 +93,11 @@ def optimise(
 
 
 def _uncertain_set(scene, robust: list[str] | None, seed: int) -> dict[str, float]:
-    """Return the half widths of friction and mass that a closed-loop law is designed for."""
+    """Return the half widths of friction, mass and vertices that a closed-loop law is designed for."""
     spreads = dict(parse_ensemble(scene, robust or ["friction=20%"], seed).spreads)
-    known = all(name in ("friction", "mass") and spread.relative for name, spread in spreads.items())
-    if not known:
-        raise BadInput("--feedback: --robust knows friction=20% and mass=10%, as fractions")
+    relative = {"friction": True, "mass": True, "vertices": False}
+    if any(relative.get(name) is not spread.relative for name, spread in spreads.items()):
+        raise BadInput("--feedback: --robust knows friction=20%, mass=10% and vertices=0.0005 [m]")
     return {name: spread.size for name, spread in spreads.items()}
 
 
@@ -106,13 +106,14 @@ def _design(optimum, uncertain: dict[str, float], as_json: bool):
 
     Args:
         optimum: the result of `optimise`.
-        uncertain: half widths of friction and mass.
+        uncertain: half widths of friction, mass and vertices.
         as_json: whether standard output is for JSON alone.
     """
     from wholearm_jax.feedback import feedback
 
     friction, mass = (uncertain.get(name, 0.0) for name in ("friction", "mass"))
-    controller = feedback(optimum.scene, optimum.torque, friction=friction, mass=mass)
+    shape = uncertain.get("vertices")
+    controller = feedback(optimum.scene, optimum.torque, friction=friction, mass=mass, shape=shape)
     for phase in controller.phases if not as_json else ():
         print(f"{phase.name}: closed loop, least force {phase.margin:.4g} N over all objects of the set")
     weakest = min(controller.phases, key=lambda phase: phase.margin)

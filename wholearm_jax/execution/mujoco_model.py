@@ -47,7 +47,7 @@ POINT_RADIUS = 1e-5  # radius of a dot [object radii]: far above rounding, its l
 PAIR_DISTANCE = (
     1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
 )
-NEVER = 1e9  # how far below its margin a contact that is left out would act
+FAR_BELOW = 1e9  # how far below its margin a contact that is left out would act
 HALF_SPACE_DEPTH = 0.2  # slabs, and all shapes in depth [object radii]
 
 
@@ -169,7 +169,7 @@ def choose_edges(bodies: MujocoModel, data: mujoco.MjData) -> None:
     normal, way = bodies.edges.normal, np.array(angles)[bodies.edges.finger] - phi  # from joint to tip
     from_outside = normal[:, 0] * np.cos(way) + normal[:, 1] * np.sin(way) <= 0
     bodies.model.pair_margin[bodies.edges.row] = np.where(
-        from_outside, bodies.edges.margin, -NEVER * bodies.edges.margin
+        from_outside, bodies.edges.margin, -FAR_BELOW * bodies.edges.margin
     )
 
 

@@ -52,6 +52,7 @@ from wholearm_jax.model import (
     Arrival,
     ContactFormation,
     Scene,
+    contact_kinematics,
     gaps,
     normal_jacobian,
     remains_simple,
@@ -59,6 +60,8 @@ from wholearm_jax.model import (
     scaled_mechanics,
 )
 from wholearm_jax.phases import Result, target_configuration, trace
+
+ROUNDING = 1e-9  # depth that is none [object radii]
 
 
 class Amounts(NamedTuple):
@@ -231,7 +234,10 @@ def _draw_displacements(scene: Scene, amounts: Amounts, seed: int, count: int) -
 
 
 def start_near(scene: Scene, z, shift) -> Float[np.ndarray, "5"]:
-    """The configuration next to `z`, its object displaced by `shift` [m], at which the first formation's gaps are 0."""
+    """The configuration next to `z`, its object displaced by `shift` [m], at which the first formation's gaps are 0.
+
+    A vertex that would then lie behind a link, as one of a side that was flush may, touches it instead.
+    """
     return np.asarray(_touch_down(scene.object, scene.hand, scene.gravity, scene.phases[0].formation, z, shift))
 
 
@@ -243,12 +249,26 @@ def _touch_down(shape, hand, gravity, formation: ContactFormation, z, shift) -> 
     if formation.is_away is not None:
         is_gap = is_gap & ~formation.is_away
 
-    def closer(_, z):
-        rows = jnp.where(is_gap[:, None], normal_jacobian(mechanics.contacts, z), 0.0)
-        gram = rows @ rows.T + jnp.diag(jnp.where(is_gap, 0.0, 1.0))
-        return z - rows.T @ jnp.linalg.solve(gram, jnp.where(is_gap, gaps(mechanics.contacts, z), 0.0))
+    def close(z, pair, closes):
+        """Newton's steps of least length to the formation, and to one pair more where `closes`."""
 
-    return jax.lax.fori_loop(0, 20, closer, displaced) * mechanics.configuration_unit
+        def closer(_, z):
+            wanted = jnp.append(is_gap, closes)
+            rows = jnp.vstack([normal_jacobian(mechanics.contacts, z), normal_jacobian(pairs, z)[pair]])
+            rows = jnp.where(wanted[:, None], rows, 0.0)
+            values = jnp.append(gaps(mechanics.contacts, z), gaps(pairs, z)[pair])
+            gram = rows @ rows.T + jnp.diag(jnp.where(wanted, 0.0, 1.0))
+            return z - rows.T @ jnp.linalg.solve(gram, jnp.where(wanted, values, 0.0))
+
+        return jax.lax.fori_loop(0, 20, closer, z)
+
+    pairs = mechanics.candidates
+    near = close(displaced, 0, False)
+    at = contact_kinematics(pairs, near)
+    obstacles = mechanics.may_terminate & ~mechanics.may_be_behind & pairs.on_link
+    depth = jnp.where(obstacles & (at.along > pairs.lower) & (at.along < pairs.upper), -at.gap, 0.0)
+    deepest = jnp.argmax(depth)
+    return close(near, deepest, depth[deepest] > ROUNDING) * mechanics.configuration_unit
 
 
 class OwnPath(NamedTuple):

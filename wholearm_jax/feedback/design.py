@@ -1,6 +1,7 @@
 """Design a controller: the curve of joint angles of each path, a reference along it, its torques, and the gains."""
 
 import itertools
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -15,13 +16,13 @@ from wholearm_jax.feedback.reference_motion import (
     scheduled_motion,
     smooth_motions,
 )
-from wholearm_jax.feedback.stop_torque import choose_push
+from wholearm_jax.feedback.stop_places import draw_shapes, has_paths, stop_places
+from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop
 from wholearm_jax.feedback.torque_choice import TorqueChoice, choose_torques
-from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule
+from wholearm_jax.model import Arrival, Scene, TorqueSchedule
 from wholearm_jax.phases import (
     TracedPhase,
     ends_at_stop,
-    formation_at_end,
     group_phases,
     require_motion,
     simulate,
@@ -33,12 +34,23 @@ from wholearm_jax.tracing import PathEnd
 RESERVE = 0.9  # fraction of the torque limits that the reference's torques and their corrections stay within
 PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
 BEYOND = 0.06  # how far the reference goes on beyond the path's end, to meet the contact that ends it [rad]
-APPROACH = 0.15  # speed with which [rad/s]
+APPROACH = 0.15  # speed with which, at least [rad/s]
+SLOW_SHARE = (
+    0.25  # of a phase's duration, in which the reference goes with that speed where stops of other parts may be
+)
 FELT = (0.05, 0.03)  # speed [rad/s] below which an object stands, and for how long [s]
 LONGEST_DELAY = 1.0  # longest time beyond a phase's duration [s]
 UNSURE = (
     0.005  # distance from a corner within which measured angles do not tell its sides: 3 counts of 4096 a turn [rad]
 )
+
+
+class Approach(NamedTuple):
+    """How a phase comes to its stop: the last part of the path is slow, and the reference reaches beyond it."""
+
+    slow: float  # [rad]
+    speed: float  # [rad/s]
+    reach: float  # [rad]
 
 
 def feedback(
@@ -50,6 +62,7 @@ def feedback(
     stiffness: float = 60.0,
     integral: float = 10.0,
     observer: float = 200.0,
+    shape: float | None = None,
     own_motion: bool = False,
 ) -> Controller:
     """Design a closed-loop law for a plan (`docs/feedback.md`).
@@ -67,6 +80,8 @@ def feedback(
         stiffness: Natural frequency `w` of the loop [1/s].
         integral: Rate of its integral part [1/s].
         observer: Rate of the filter for place and speed [1/s].
+        shape: Half width of the vertices' coordinates [m], unless given 1 % of the object's radius. Phases that end at
+            a stop approach it slowly from where it may be, first, and go on to where it may be, last.
         own_motion: Follow the schedule's own motion, instead of the smooth one with the largest margin.
 
     Returns:
@@ -87,16 +102,20 @@ def feedback(
     scenes = corner_scenes(scene, friction, mass)
     traces = [tuple(phase.traced for phase in result.phases), *(trace(other) for other in scenes[1:])]
     tables = [tabulate_path(path.dynamics) for path in traces[0]]
+    shapes = draw_shapes(scenes, shape)
+    drawn = [trace(other) for other in shapes]
+    approaches = _approaches(scene, traces[0], tables, drawn)
     terms = [[path_terms(paths[k].dynamics, table) for paths in traces] for k, table in enumerate(tables)]
     either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
     limit = RESERVE * np.asarray(scene.hand.torque_limit)
+    objects = [*zip(scenes, traces, strict=True), *zip(shapes, drawn, strict=True)]
     laws = []
     for group in group_phases(scene):
-        options = _motions(scene, group, tables, trajectory(result), own_motion)
+        options = _motions(scene, group, tables, approaches, trajectory(result), own_motion)
         choices = [[_choose(either[k], tables[k], limit, m) for k, m in zip(group, o, strict=True)] for o in options]
         best = int(np.argmax([min(float(c.margin.min()) for c in row) for row in choices]))
         for k, motion, choice in zip(group, options[best], choices[best], strict=True):
-            laws.append(_phase_law(scenes, scene.phases[k], tables[k], terms[k], motion, choice, traces[0][k]))
+            laws.append(_phase_law(scene, k, tables[k], terms[k][0], motion, choice, approaches[k], objects))
     return Controller(
         title=scene.title,
         phases=tuple(laws),
@@ -110,14 +129,31 @@ def feedback(
     )
 
 
-def _motions(scene: Scene, group, tables, courses, own_motion: bool) -> list[list[ReferenceMotion]]:
+def _approaches(
+    scene: Scene, traced: tuple[TracedPhase, ...], tables: list[PathTable], drawn: list[tuple[TracedPhase, ...]]
+) -> list[Approach | None]:
+    """Say how each phase approaches the stop that ends it; None where nothing stops the object there."""
+    found: list[Approach | None] = []
+    for phase, path, table, stop in zip(scene.phases, traced, tables, stop_places(tables, drawn), strict=True):
+        length, duration, slow = float(table.s[-1]), float(phase.duration), stop.before
+        speed = max(APPROACH, slow / (SLOW_SHARE * duration))
+        if length - slow < speed * (duration - slow / speed):  # it is slow anyway
+            slow, speed = 0.0, APPROACH
+        stops = phase.arrive is not Arrival.MOVING and ends_at_stop(scene, phase, path)
+        found.append(Approach(slow, speed, max(slow, BEYOND + stop.beyond)) if stops else None)
+    return found
+
+
+def _motions(scene: Scene, group, tables, approaches, courses, own_motion: bool) -> list[list[ReferenceMotion]]:
     """Motions to choose from, one a phase of the group in each."""
     if own_motion:
         return [[scheduled_motion(tables[k], courses[k]) for k in group]]
     durations = [float(scene.phases[k].duration) for k in group]
     lengths = [tables[k].s[-1] for k in group]
     if len(group) == 1:
-        return [[motion] for motion in smooth_motions(tables[group[0]], durations[0])]
+        approach = approaches[group[0]] or Approach(0.0, 0.0, 0.0)
+        length = tables[group[0]].s[-1]
+        return [[motion] for motion in smooth_motions(length, durations[0], approach.slow, approach.speed)]
     speed = [np.hypot(*np.asarray(courses[k].z_dot)[[0, -1], 3:].T) for k in group]
     ratios = [after[0] / before[1] for before, after in itertools.pairwise(speed)]  # of the impacts
     options = []
@@ -188,23 +224,24 @@ def corner_scenes(scene: Scene, friction: float, mass: float) -> list[Scene]:
 
 
 def _phase_law(
-    scenes: list[Scene],
-    phase: Phase,
+    scene: Scene,
+    k: int,
     table: PathTable,
-    every: list[PathTerms],
+    terms: PathTerms,
     motion: ReferenceMotion,
     choice: TorqueChoice,
-    traced: TracedPhase,
+    approach: Approach | None,
+    objects: list[tuple[Scene, tuple[TracedPhase, ...]]],
 ) -> PhaseLaw:
-    """Put the law of one phase together."""
+    """Put the law of phase `k` together, for the nominal object's `terms` and the stops of all objects with paths."""
+    phase = scene.phases[k]
     gain = np.stack([np.interp(table.s, motion.s, choice.gain[:, j]) for j in range(2)], axis=1)
-    stops = phase.arrive is not Arrival.MOVING and ends_at_stop(scenes[0], phase, traced)
     press = 0.0
-    if stops:
-        closed = formation_at_end(scenes[0], phase, traced)
-        press, gain_at_stop = choose_push(scenes, closed, np.asarray(traced.end), every, choice.torque[-1])
-        gain[table.s > table.s[-1] - BEYOND] = gain_at_stop
-    gain /= (gain * every[0].acceleration[:, 3:]).sum(1, keepdims=True)
+    if approach is not None:
+        stops = [object_at_stop(one, phase, paths[k]) for one, paths in objects if has_paths(paths[: k + 1])]
+        press, gain_at_stop = choose_push(stops, choice.torque[-1], np.asarray(scene.hand.torque_limit))
+        gain[table.s > table.s[-1] - approach.reach] = gain_at_stop
+    gain /= (gain * terms.acceleration[:, 3:]).sum(1, keepdims=True)
     return PhaseLaw(
         name=phase.name,
         contacts=phase.formation.names,
@@ -217,8 +254,8 @@ def _phase_law(
         s_ref=motion.s,
         v_ref=motion.v,
         torque=choice.torque,
-        reach=BEYOND if stops else 0.0,
-        approach=APPROACH,
+        reach=approach.reach if approach is not None else 0.0,
+        approach=approach.speed if approach is not None else APPROACH,
         press=press,
         margin=float(choice.margin.min()),
     )

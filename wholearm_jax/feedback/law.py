@@ -28,7 +28,7 @@ class LawState(NamedTuple):
     v: float  # speed [rad/s]
     offset: float  # place at the phase's start against the reference [rad]
     i: float  # integral part of the acceleration [rad/s^2]
-    still: float  # time for which the object has not moved [s]
+    still: float  # time for which the object has not moved although it was pressed [s]
     pressed: bool  # whether the feedback pushes forward as far as it may
     arrived: bool  # whether the last phase has ended
 
@@ -104,7 +104,7 @@ def _observe(controller: Controller, state: LawState, time: float, angles) -> La
     predicted = state.s + h * state.v
     off = project_on_path(controller.phases[state.phase], angles, predicted) - predicted
     s, v = predicted + (1 - r**2) * off, state.v + (1 - r) ** 2 * off / h if h > 0 else state.v
-    still = state.still + h if abs(v) < controller.felt[0] else 0.0
+    still = state.still + h if state.pressed and abs(v) < controller.felt[0] else 0.0
     return state._replace(s=float(s), v=float(v), still=still)
 
 

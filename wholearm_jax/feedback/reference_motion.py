@@ -22,19 +22,28 @@ class ReferenceMotion(NamedTuple):
     a: Float[np.ndarray, "times"]
 
 
-def smooth_motions(table: PathTable, duration: float) -> list[ReferenceMotion]:
-    """Return motions from rest to rest with the speeds of `SPEED_EXPONENTS`."""
-    u = np.linspace(0.0, 1.0, TIMES)
-    return [_profile_motion(u, p, q, table.s[-1], duration) for p, q in SPEED_EXPONENTS]
+def smooth_motions(length: float, duration: float, slow: float = 0.0, approach: float = 0.0) -> list[ReferenceMotion]:
+    """Return motions over a path's `length` [rad] with the speeds of `SPEED_EXPONENTS`.
+
+    They begin at rest, and end at rest or, for the last part `slow` [rad] of the path, go on with the speed `approach`
+    [rad/s].
+    """
+    return [_profile_motion(p, q, length, duration, slow, approach) for p, q in SPEED_EXPONENTS]
 
 
-def _profile_motion(u, p: int, q: int, length: float, duration: float) -> ReferenceMotion:
-    speed = np.polynomial.Polynomial([0.0] * p + [1.0]) * np.polynomial.Polynomial([1.0, -1.0]) ** q
-    place = speed.integ()
-    unit = length / place(1.0)
-    acceleration = unit * speed.deriv()(u) / duration**2
-    acceleration[-1] = 0.0  # what stands is not braked any more
-    return ReferenceMotion(u * duration, unit * place(u), unit * speed(u) / duration, acceleration)
+def _profile_motion(p: int, q: int, length: float, duration: float, slow: float, approach: float) -> ReferenceMotion:
+    # Up to the slow part, at `fast` [s], the speed is a polynomial in u, with a part that rises to the approach's.
+    time = np.linspace(0.0, duration, TIMES)
+    fast = duration - slow / approach if slow > 0 else duration
+    rise = np.polynomial.Polynomial([0.0, 0.0, 3.0, -2.0]) * (approach * fast if slow > 0 else 0.0)
+    bump = np.polynomial.Polynomial([0.0] * p + [1.0]) * np.polynomial.Polynomial([1.0, -1.0]) ** q
+    unit = (length - slow - rise.integ()(1.0)) / bump.integ()(1.0)
+    speed = unit * bump + rise
+    u = np.minimum(time / fast, 1.0)
+    acceleration = speed.deriv()(u) / fast**2
+    acceleration[time >= fast] = 0.0  # what stands is not braked any more
+    place = speed.integ()(u) + approach * np.maximum(time - fast, 0.0)
+    return ReferenceMotion(time, place, speed(u) / fast, acceleration)
 
 
 def passing_motion(length: float, duration: float, entry: float, exit_: float) -> ReferenceMotion:

@@ -1,49 +1,59 @@
 """The push with which a phase ends against a new contact: enough for every object to arrive, little enough to stay."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
-from wholearm_jax.feedback.path_table import PathTerms
-from wholearm_jax.margin import contact_statics
-from wholearm_jax.model import ContactFormation, Scene
+from wholearm_jax.feedback.path_table import path_terms, tabulate_path
+from wholearm_jax.margin import Statics, contact_statics
+from wholearm_jax.model import Phase, Scene
+from wholearm_jax.phases import TracedPhase, formation_at_end
 
 LARGEST, TRIED = 60.0, 13  # pushes that are tried [rad/s^2]
 TURNS = np.linspace(-1.2, 1.2, 7)  # their directions against that which accelerates most [rad]
 DECISIVE = 10.0  # least acceleration of the object that is hardest to move, before it stops [rad/s^2]
 
 
+class StopStatics(NamedTuple):
+    """An object at its stop: the statics of the contacts that are closed there, and how it moved just before."""
+
+    statics: Statics
+    acceleration: Float[np.ndarray, "5"]  # of `PathTerms`, at the path's end
+
+
+def object_at_stop(scene: Scene, phase: Phase, path: TracedPhase) -> StopStatics:
+    """Return an object at the end of its path of a phase."""
+    closed, end = formation_at_end(scene, phase, path), np.asarray(path.end)
+    terms = path_terms(path.dynamics, tabulate_path(path.dynamics))
+    return StopStatics(contact_statics(scene, closed, end), terms.acceleration[-1])
+
+
 def choose_push(
-    scenes: list[Scene],
-    closed: ContactFormation,
-    z: Float[np.ndarray, "5"],
-    every: list[PathTerms],
-    torque: Float[np.ndarray, "2"],
+    stops: list[StopStatics], torque: Float[np.ndarray, "2"], limit: Float[np.ndarray, "2"]
 ) -> tuple[float, Float[np.ndarray, "2"]]:
     """Choose the push with which objects arrive at a stop and stand there.
 
     Args:
-        scenes: The objects.
-        closed: The formation with the contact that is made.
-        z: Where it is made.
-        every: The objects' equations of motion on the phase's path.
+        stops: The objects, the nominal one first.
         torque: The reference's last torque [N m].
+        limit: The torque limits [N m].
 
     Returns:
         The acceleration [rad/s^2] that the feedback adds at most, and the torques for one of them [N m s^2]. Of all
         pushes within the torque limits with which every object is accelerated by `DECISIVE`, it is that with the
         largest margin at rest (the least of all objects); where there are none, that which accelerates most.
     """
-    pull = every[0].acceleration[-1, 3:]
+    pull = stops[0].acceleration[3:]
     ahead, across = pull / np.hypot(*pull), np.array([-pull[1], pull[0]]) / np.hypot(*pull)
     directions = (ahead + np.tan(TURNS)[:, None] * across) / np.hypot(*pull)
     pushes = np.linspace(0.0, LARGEST, TRIED)
     torques = (torque + pushes[:, None, None] * directions).reshape(-1, 2)
-    moves = np.min([t.acceleration[-1, 0] + torques @ t.acceleration[-1, 3:] for t in every], axis=0)
-    held = [contact_statics(scene, closed, z) for scene in scenes]
-    within = np.all(np.abs(torques) <= np.asarray(scenes[0].hand.torque_limit), axis=1)
+    moves = np.min([stop.acceleration[0] + torques @ stop.acceleration[3:] for stop in stops], axis=0)
+    within = np.all(np.abs(torques) <= limit, axis=1)
     margin = np.full(len(torques), -np.inf)
     for k in np.flatnonzero(within & (moves >= DECISIVE)):
-        margin[k] = min(statics.margin_under(torques[k]).margin for statics in held)
+        margin[k] = min(stop.statics.margin_under(torques[k]).margin for stop in stops)
     decisive = within & (moves >= DECISIVE)
     chosen = int(np.argmax(np.where(decisive, margin, -np.inf) if decisive.any() else np.where(within, moves, -np.inf)))
     push, turn = divmod(chosen, len(TURNS))

@@ -16,6 +16,8 @@ from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
 from wholearm_jax.plotting.pose_figures import object_outline, plot_pose, pose_grid
 from wholearm_jax.plotting.style import INK, PAGE, PALE, format_time_axis
 
+SOFT = 2e-3  # depth of soft contacts that is not marked as an overlap [object radii; rad]
+
 if TYPE_CHECKING:  # running it needs MuJoCo, drawing does not
     from wholearm_jax.execution import Execution
 
@@ -70,11 +72,12 @@ def animate(execution: Execution, frames_per_second: int = 25, ax: Axes | None =
 def _plot_step(execution: Execution, row: int, ax: Axes) -> None:
     """Plot the executed pose of time step `row`, and the predicted object's outline."""
     time = execution.course.time[row]
-    plot_pose(execution.prediction.scene, execution.course.z[row], ax, label=f"$t$ = {time:.2f} s")
+    scene, z = execution.prediction.scene, execution.course.z[row]
+    plot_pose(scene, z, ax, label=f"$t$ = {time:.2f} s", tolerance=SOFT)
     expected = execution.expected
     if time <= expected.time[-1] + 1e-9:
-        z = expected.z[min(np.searchsorted(expected.time, time - 1e-9), len(expected.time) - 1)]
-        outline = object_outline(execution.prediction.scene, z)
+        z = np.stack([np.interp(time, expected.time, expected.z[:, k]) for k in range(5)])
+        outline = object_outline(scene, z)
         ax.add_patch(Patch(outline, closed=True, fill=False, edgecolor=COLOURS[1], lw=0.8, ls="--", zorder=4))
 
 

@@ -15,8 +15,13 @@ from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
 from wholearm_jax.plotting.style import ALARM, FILL, INK, PAGE, PALE
 
 
-def plot_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbers: bool = False) -> Axes:
-    """The hand and the object at configuration `z` [m, rad]; `numbers` labels the vertices."""
+def plot_pose(
+    scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbers: bool = False, tolerance: float = 1e-9
+) -> Axes:
+    """The hand and the object at configuration `z` [m, rad]; `numbers` labels the vertices.
+
+    Overlaps deeper than `tolerance`, in the object's radius or radians, are marked.
+    """
     ax = ax or plt.gca()
     z = np.asarray(z)
     outline = object_outline(scene, z)
@@ -31,7 +36,7 @@ def plot_pose(scene: Scene, z, ax: Axes | None = None, *, label: str = "", numbe
         segments.append(ends)
         ax.plot(*ends.T, color=COLOURS[k], lw=2.5, solid_capstyle="round")
         ax.plot(*joint, "o", color=COLOURS[k], ms=4)
-    _mark_overlaps(scene, z, outline, segments, ax)
+    _mark_overlaps(scene, z, outline, segments, ax, tolerance)
     ax.plot(z[0], z[1], "+", color=INK, ms=5)
     if numbers:
         inward = z[:2] - outline
@@ -65,9 +70,9 @@ def plot_strip(result: Result, poses: int = 4, axes=None) -> np.ndarray:
     return axes
 
 
-def _mark_overlaps(scene: Scene, z, outline, segments, ax: Axes) -> None:
+def _mark_overlaps(scene: Scene, z, outline, segments, ax: Axes, tolerance: float) -> None:
     """Mark where links lie in one another or in the object, with the pair and the depth in words."""
-    lines = describe_overlaps(scene, z)
+    lines = describe_overlaps(scene, z, tolerance)
     if not lines:
         return
     first, second = (LineString(ends) for ends in segments)

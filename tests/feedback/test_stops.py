@@ -1,0 +1,70 @@
+"""Parts of other shape meet their stops elsewhere: the law comes to them slowly, and goes on to those that are late."""
+
+import numpy as np
+import pytest
+
+import wholearm_jax as wa
+from wholearm_jax.execution import Amounts, run_trials
+from wholearm_jax.feedback import feedback
+from wholearm_jax.feedback.path_table import tabulate_path
+from wholearm_jax.feedback.reference_motion import smooth_motions
+from wholearm_jax.feedback.stop_places import draw_shapes, stop_places
+
+SHAPE = 5e-4
+
+
+@pytest.fixture(scope="module")
+def heptagon():
+    scene = wa.load("heptagon")
+    return wa.simulate(scene, wa.quasistatic(scene))
+
+
+@pytest.mark.parametrize(("slow", "approach"), [(0.0, 0.0), (0.07, 0.28)])
+def test_a_reference_comes_to_the_end_in_time(slow, approach):
+    for motion in smooth_motions(1.6, 1.0, slow, approach):
+        assert motion.s[0] == motion.v[0] == 0
+        assert motion.s[-1] == pytest.approx(1.6, abs=1e-12)
+        assert motion.v[-1] == pytest.approx(approach, abs=1e-12)
+        assert (motion.v >= 0).all()
+        late = motion.s > 1.6 - slow
+        np.testing.assert_allclose(motion.v[late][:-1], approach, atol=0.05)
+        steps = np.diff(motion.time)
+        np.testing.assert_allclose(np.diff(motion.s), steps * (motion.v[1:] + motion.v[:-1]) / 2, atol=2e-4)
+        np.testing.assert_allclose(np.diff(motion.v)[:60], (steps * (motion.a[1:] + motion.a[:-1]) / 2)[:60], atol=1e-2)
+
+
+def test_stops_of_drawn_parts_lie_within_what_is_said(heptagon):
+    scene = heptagon.scene
+    tables = [tabulate_path(phase.traced.dynamics) for phase in heptagon.phases]
+    places, smaller = (
+        stop_places(tables, [wa.trace(part) for part in draw_shapes([scene], shape)]) for shape in (SHAPE, SHAPE / 10)
+    )
+    for table, place, near in zip(tables, places, smaller, strict=True):
+        assert 0 < near.before < place.before < 0.1 * table.s[-1]
+        assert 0 < near.beyond < place.beyond < 0.1 * table.s[-1]
+    # Of parts that were not drawn, few stop beyond what was said of those that were.
+    others = [wa.trace(part) for part in draw_shapes([scene], SHAPE, seed=1)]
+    for k, (table, place) in enumerate(zip(tables, places, strict=True)):
+        alone = [stop_places(tables[: k + 1], [other[: k + 1]])[k] for other in others]
+        outside = sum(other.before > place.before or other.beyond > place.beyond for other in alone)
+        assert outside <= 2, (alone, place, table.s[-1])
+
+
+def test_without_a_shape_the_reference_stops_at_the_end(heptagon):
+    law = feedback(heptagon.scene, heptagon.torque, friction=0.0, shape=0.0)
+    for phase in law.phases:
+        assert phase.v_ref[-1] == 0
+        assert phase.reach == 0.06
+    other = feedback(heptagon.scene, heptagon.torque, friction=0.0, shape=SHAPE)
+    for phase in other.phases:
+        assert phase.reach > 0.06
+        assert phase.v_ref[-1] == pytest.approx(phase.approach)
+    with pytest.raises(ValueError, match="edges of the polygon could cross"):
+        feedback(heptagon.scene, heptagon.torque, shape=0.02)
+
+
+def test_parts_of_other_shape_arrive_at_their_own_stops(heptagon):
+    law = feedback(heptagon.scene, heptagon.torque, friction=0.2, mass=0.1, shape=SHAPE)
+    amounts = Amounts(friction=0.2, mass=0.1, geometry=SHAPE, start=1e-3)
+    trials = run_trials(heptagon, 10, amounts, seed=0, timestep=4e-4, controller=law)
+    assert trials.own_successes == 10
