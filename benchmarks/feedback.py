@@ -20,7 +20,7 @@ from wholearm_jax.ensembles import wilson_interval
 from wholearm_jax.execution import Amounts, Hardware, run_trials
 from wholearm_jax.plotting import LINK_COLOURS as COLOURS
 
-SCENES = ("heptagon", "hexagon", "tipping", "flight", "passage")
+SCENES = ("heptagon", "hexagon", "tipping", "box", "flight", "passage")
 SETS = {
     "friction": Amounts(friction=0.2),
     "friction, mass, vertices, start": Amounts(friction=0.2, mass=0.1, geometry=5e-4, start=1e-3),

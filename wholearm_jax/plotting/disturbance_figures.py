@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
-from wholearm_jax.plotting.style import INK, PALE
+from wholearm_jax.plotting.style import INK
 
 if TYPE_CHECKING:  # running executions needs MuJoCo, drawing them does not
     from wholearm_jax.execution import DisturbanceMap
@@ -29,7 +29,7 @@ def plot_disturbance_map(found: DisturbanceMap, ax: Axes | None = None) -> Axes:
     ax.set_ylabel(found.kind)
     if not isinstance(found.columns[0], str):
         ax.set_xlabel("begins at [s]")
-    ax.set_facecolor(PALE)
+    ax.set_facecolor("0.95")
     ax.tick_params(colors=INK, length=0)
     ax.spines[:].set_visible(False)
     return ax
