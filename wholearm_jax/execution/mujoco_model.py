@@ -166,8 +166,8 @@ def _edge_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid, margin: fl
 def choose_edges(bodies: MujocoModel, data: mujoco.MjData) -> None:
     """Leave out, for the next step, fingertips against edges from whose inner side their fingers come."""
     _, _, phi, *angles = data.qpos
-    normal, way = bodies.edges.normal, np.array(angles)[bodies.edges.finger] - phi  # from joint to tip
-    from_outside = normal[:, 0] * np.cos(way) + normal[:, 1] * np.sin(way) <= 0
+    normal, toward_tip = bodies.edges.normal, np.array(angles)[bodies.edges.finger] - phi
+    from_outside = normal[:, 0] * np.cos(toward_tip) + normal[:, 1] * np.sin(toward_tip) <= 0
     bodies.model.pair_margin[bodies.edges.row] = np.where(
         from_outside, bodies.edges.margin, -FAR_BELOW * bodies.edges.margin
     )

@@ -253,12 +253,12 @@ def _touch_down(shape, hand, gravity, formation: ContactFormation, z, shift) -> 
         """Newton's steps of least length to the formation, and to one pair more where `closes`."""
 
         def closer(_, z):
-            wanted = jnp.append(is_gap, closes)
+            closed = jnp.append(is_gap, closes)
             rows = jnp.vstack([normal_jacobian(mechanics.contacts, z), normal_jacobian(pairs, z)[pair]])
-            rows = jnp.where(wanted[:, None], rows, 0.0)
+            rows = jnp.where(closed[:, None], rows, 0.0)
             values = jnp.append(gaps(mechanics.contacts, z), gaps(pairs, z)[pair])
-            gram = rows @ rows.T + jnp.diag(jnp.where(wanted, 0.0, 1.0))
-            return z - rows.T @ jnp.linalg.solve(gram, jnp.where(wanted, values, 0.0))
+            gram = rows @ rows.T + jnp.diag(jnp.where(closed, 0.0, 1.0))
+            return z - rows.T @ jnp.linalg.solve(gram, jnp.where(closed, values, 0.0))
 
         return jax.lax.fori_loop(0, 20, closer, z)
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Float
 
 from wholearm_jax.core import Status, require_positive
 from wholearm_jax.feedback.controller import Controller, PhaseLaw
@@ -35,14 +36,10 @@ RESERVE = 0.9  # fraction of the torque limits that the reference's torques and 
 PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
 BEYOND = 0.06  # how far the reference goes on beyond the path's end, to meet the contact that ends it [rad]
 APPROACH = 0.15  # speed with which, at least [rad/s]
-SLOW_SHARE = (
-    0.25  # of a phase's duration, in which the reference goes with that speed where stops of other parts may be
-)
+SLOW_SHARE = 0.25  # of a phase's duration, at most, that the reference takes to cross where stops of other parts may be
 FELT = (0.05, 0.03)  # speed [rad/s] below which an object stands, and for how long [s]
 LONGEST_DELAY = 1.0  # longest time beyond a phase's duration [s]
-UNSURE = (
-    0.005  # distance from a corner within which measured angles do not tell its sides: 3 counts of 4096 a turn [rad]
-)
+UNSURE = 0.005  # distance from a corner within which angles do not tell its sides: 3 counts of 4096 a turn [rad]
 
 
 class Approach(NamedTuple):
@@ -152,8 +149,7 @@ def _motions(scene: Scene, group, tables, approaches, courses, own_motion: bool)
     lengths = [tables[k].s[-1] for k in group]
     if len(group) == 1:
         approach = approaches[group[0]] or Approach(0.0, 0.0, 0.0)
-        length = tables[group[0]].s[-1]
-        return [[motion] for motion in smooth_motions(length, durations[0], approach.slow, approach.speed)]
+        return [[motion] for motion in smooth_motions(lengths[0], durations[0], approach.slow, approach.speed)]
     speed = [np.hypot(*np.asarray(courses[k].z_dot)[[0, -1], 3:].T) for k in group]
     ratios = [after[0] / before[1] for before, after in itertools.pairwise(speed)]  # of the impacts
     options = []
@@ -193,18 +189,23 @@ def _with_either_formation(
 def _replaced(own: PathTerms, rows, other: PathTerms, at: int) -> PathTerms:
     """Replace some rows of a path's terms by those at one place of another path."""
     facets = max(own.slack.shape[1], other.slack.shape[1])
-    slack, there = (np.take(each.slack, np.arange(facets), axis=1, mode="clip") for each in (own, other))
+    slack, there = (_with_facets(each.slack, facets) for each in (own, other))
     return PathTerms(
         np.where(rows[:, None], other.acceleration[at], own.acceleration),
         np.where(rows[:, None, None], there[at], slack),
     )
 
 
+def _with_facets(slack: Float[np.ndarray, "nodes facets 5"], count: int) -> Float[np.ndarray, "nodes count 5"]:
+    """Repeat the last facet until there are `count`, as formations of fewer contacts have fewer."""
+    return np.take(slack, np.arange(count), axis=1, mode="clip")
+
+
 def _choose(every: list[PathTerms], table: PathTable, limit, motion: ReferenceMotion) -> TorqueChoice:
     """Choose torques and gains at the nodes next to a motion's places."""
     nodes = np.abs(motion.s[:, None] - table.s).argmin(1)
-    facets = np.arange(max(terms.slack.shape[1] for terms in every))
-    at = [PathTerms(t.acceleration[nodes], np.take(t.slack[nodes], facets, axis=1, mode="clip")) for t in every]
+    facets = max(terms.slack.shape[1] for terms in every)
+    at = [PathTerms(terms.acceleration[nodes], _with_facets(terms.slack[nodes], facets)) for terms in every]
     return choose_torques(at, limit, motion.v, motion.a)
 
 

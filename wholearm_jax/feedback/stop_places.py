@@ -51,19 +51,15 @@ def stop_places(tables: list[PathTable], drawn: list[tuple[TracedPhase, ...]]) -
     found = []
     for k, table in enumerate(tables):
         ends = [np.asarray(paths[k].end)[3:] for paths in drawn if has_paths(paths[: k + 1])]
-        after = [_place(table, end) - table.s[-1] for end in ends]
+        after = np.array([_place(table, end) - table.s[-1] for end in ends])
         farthest = FARTHEST * table.s[-1]
-        found.append(StopPlaces(*(float(np.clip(side, 0.0, farthest).max(initial=0.0)) for side in _sides(after))))
+        found.append(StopPlaces(*(float(np.clip(side, 0.0, farthest).max(initial=0.0)) for side in (-after, after))))
     return found
 
 
 def has_paths(paths: tuple[TracedPhase, ...]) -> bool:
     """Say whether all of an object's paths can be traced."""
     return all(int(path.dynamics.status) == Status.OK for path in paths)
-
-
-def _sides(after: list[float]) -> tuple[Float[np.ndarray, "ends"], Float[np.ndarray, "ends"]]:
-    return -np.array(after), np.array(after)
 
 
 def _place(table: PathTable, theta: Float[np.ndarray, "2"]) -> float:

@@ -51,10 +51,10 @@ def choose_push(
     torques = (torque + pushes[:, None, None] * directions).reshape(-1, 2)
     moves = np.min([stop.acceleration[0] + torques @ stop.acceleration[3:] for stop in stops], axis=0)
     within = np.all(np.abs(torques) <= limit, axis=1)
-    margin = np.full(len(torques), -np.inf)
-    for k in np.flatnonzero(within & (moves >= DECISIVE)):
-        margin[k] = min(stop.statics.margin_under(torques[k]).margin for stop in stops)
     decisive = within & (moves >= DECISIVE)
+    margin = np.full(len(torques), -np.inf)
+    for k in np.flatnonzero(decisive):
+        margin[k] = min(stop.statics.margin_under(torques[k]).margin for stop in stops)
     chosen = int(np.argmax(np.where(decisive, margin, -np.inf) if decisive.any() else np.where(within, moves, -np.inf)))
     push, turn = divmod(chosen, len(TURNS))
     return float(pushes[push]), directions[turn]
