@@ -80,22 +80,27 @@ time.sleep(60)
     )
 
 
-def test_ctrl_c_ends_workers():
-    """Of perturbed executions, which a terminal interrupts with the command: none is left, none says a word."""
+@pytest.mark.parametrize("moment", [0.0, 0.02, 0.05, 0.1])
+def test_ctrl_c_ends_workers(moment):
+    """Of perturbed executions, which a terminal interrupts with the command: none is left, none says a word.
+
+    One of the two may still be starting when the first result is there.
+    """
     pytest.importorskip("joblib")
     script = """
 import time
-from wholearm_jax.cli.interruption import exit_on_interrupt, quieten_workers
+from wholearm_jax.cli.interruption import exit_on_interrupt, quiet_workers
 exit_on_interrupt()
-quieten_workers()
 from joblib import Parallel, delayed
-for _ in Parallel(n_jobs=2, return_as="generator")(delayed(time.sleep)(0.2) for _ in range(1000)):
-    print("one", flush=True)
+with quiet_workers():
+    for _ in Parallel(n_jobs=2, return_as="generator")(delayed(time.sleep)(0.2 * i) for i in range(1000)):
+        print("one", flush=True)
 """
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", script], start_new_session=True, **pipes) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "one\n"
+        time.sleep(moment)
         os.killpg(process.pid, signal.SIGINT)
         _, err = process.communicate(timeout=60)  # which waits for all that hold the pipes
     assert (process.returncode, err) == (130, "wholearm: interrupted\n")

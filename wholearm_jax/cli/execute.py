@@ -15,7 +15,7 @@ from wholearm_jax.cli.arguments import (
     make_output_folder,
     refuse_unwritable,
 )
-from wholearm_jax.cli.interruption import quieten_workers
+from wholearm_jax.cli.interruption import quiet_workers
 from wholearm_jax.cli.output import may_replace
 from wholearm_jax.cli.prediction import read_controller_of, simulate_or_exit, trace_or_exit
 from wholearm_jax.cli.progress import count_progress
@@ -161,8 +161,7 @@ def _run_trials(prediction, count: int, amounts, **settings):
     """Execute perturbed objects, with a progress bar."""
     from wholearm_jax.execution import ExecutionOutcome, run_trials
 
-    quieten_workers()
-    with count_progress("{task.fields[succeed]} succeed") as progress:
+    with quiet_workers(), count_progress("{task.fields[succeed]} succeed") as progress:
         bar, succeed = progress.add_task("perturbed executions", total=count, succeed=0), 0
 
         def show(trial) -> None:

@@ -13,8 +13,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 INTERRUPTED = 130  # exit status: 128 and the number of SIGINT
@@ -80,10 +80,24 @@ def _is_being_written(folder: Path) -> bool:
         return any(now - entry.stat().st_mtime < CACHE_QUIET for entry in entries)
 
 
-def quieten_workers() -> None:
-    """Keep the process that tidies up after ended workers, which is yet to be started, from reporting each of them."""
+@contextmanager
+def quiet_workers() -> Iterator[None]:
+    """Let the processes that are started meanwhile say nothing when a terminal interrupts them with this one.
+
+    They inherit the signals that this thread blocks, from their first instruction on, and are ended by this process,
+    whose own thread for signals still wakes. Their tracker of resources, which unblocks them, is started before, and
+    told not to report each worker that was ended.
+    """
+    from multiprocessing import resource_tracker  # not needed by most commands
+
     others = os.environ.get("PYTHONWARNINGS")
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (others, "ignore:resource_tracker")))
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _end_workers() -> None:
