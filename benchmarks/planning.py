@@ -36,7 +36,7 @@ GOALS = {
     "slide 20 mm, turn 30 deg": {"x": -0.02, "phi": -np.radians(30)},
 }
 FINGER = {"inertia": 2e-3, "viscous": 0.02, "dry": 0.01, "torque_limit": 1.0}
-PLANNERS = ("rolling", "sliding only", "random tree")
+PLANNERS = ("regrasps", "rolling", "sliding only", "random tree")
 GOAL_SHARE = 0.2  # of the random tree's targets that are the goal
 
 

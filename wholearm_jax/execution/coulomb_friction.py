@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from wholearm_jax.execution.mujoco_model import MujocoModel, choose_edges
+from wholearm_jax.execution.mujoco_model import MujocoModel, choose_pairs
 
 EXACT, ROUNDS = 1e-6, 100  # when to stop: share of the largest friction by which forces still change; rounds at most
 
@@ -37,7 +37,7 @@ def advance(
     several contacts is not determined), and much where no forces agree with that law, as there need not be any if
     friction is large.
     """
-    choose_edges(bodies, data)
+    choose_pairs(bodies, data)
     mujoco.mj_step1(bodies.model, data)
     data.ctrl[:] = torque
     pair, address, rows = _touching(bodies, data)
@@ -91,7 +91,7 @@ def _touching(
     rows = np.zeros((len(touching), 5))
     rows[:, 0], rows[:, 1] = tangent_x, tangent_y
     rows[:, 2] = tangent_y * (x - data.qpos[0]) - tangent_x * (y - data.qpos[1])
-    for finger, (joint_x, joint_y) in enumerate(bodies.joint):
+    for finger, (joint_x, joint_y) in enumerate(bodies.hand.joint):
         turning = tangent_x * (y - joint_y) - tangent_y * (x - joint_x)
         rows[:, 3 + finger] = np.where(bodies.link[pair] == finger + 1, turning, 0.0)
     return pair, contact.efc_address[touching], rows

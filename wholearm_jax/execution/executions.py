@@ -30,7 +30,7 @@ from wholearm_jax.execution.closed_loop import (
 )
 from wholearm_jax.execution.coulomb_friction import advance
 from wholearm_jax.execution.link_meetings import record_meetings, unexpected_meetings
-from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model, choose_edges
+from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model, choose_pairs
 from wholearm_jax.execution.pushes import Push, push_force
 from wholearm_jax.feedback import Controller, planned_motion
 from wholearm_jax.model import (
@@ -295,7 +295,7 @@ def stepper(bodies: MujocoModel) -> Callable:
 
 
 def _advance(bodies: MujocoModel, data: mujoco.MjData, torque, before, push=0.0):
-    choose_edges(bodies, data)
+    choose_pairs(bodies, data)
     data.ctrl[:] = torque
     data.qfrc_applied[:] = push
     mujoco.mj_step(bodies.model, data)  # its contacts are those of the state before the step

@@ -14,13 +14,14 @@ make MuJoCo's distances equal the C-functions:
   object. Wedges do not overlap, so that a concave object needs no decomposition. (MuJoCo keeps their corners in single
   precision: a few nanometres.)
 
-The links are bodies among themselves, too: fingertips and joints are dots against the other finger, on the side of it
-on which they start, and fingertips against the palm, without friction; ranges are joint limits. Layered fingers do not
-meet.
+The links are bodies among themselves, too: fingertips and joints are dots against the other finger, and fingertips
+against the palm, without friction; ranges are joint limits. Layered fingers do not meet.
 
-A fingertip touches an edge only where its finger comes from the edge's outer side (`choose_edges`, before every step):
-from the inner side the finger meets an end of the edge first, and a tip that slips past that vertex, a little inside
-it, would catch on the edge.
+Slabs are thicker than what they stand for, so two kinds of pairs act only where they should (`choose_pairs`, before
+every step). A fingertip touches an edge only where its finger comes from the edge's outer side: from the inner side the
+finger meets an end of the edge first, and a tip that slips past that vertex, a little inside it, would catch on the
+edge. And a dot meets that face of the other finger on whose side it last was beyond that finger's end, around which it
+may pass.
 
 A pair thus touches at one point of the plane. If `a_free` is the acceleration of the gap `C` without the contact, then
 
@@ -39,9 +40,19 @@ from typing import Literal
 import jax
 import mujoco
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from wholearm_jax.model import EDGE, LINKS, VERTEX, Scene, contact_candidates, contact_name, parse_contact, rigid_body
+from wholearm_jax.model import (
+    EDGE,
+    LINKS,
+    VERTEX,
+    Hand,
+    Scene,
+    contact_candidates,
+    contact_name,
+    parse_contact,
+    rigid_body,
+)
 
 POINT_RADIUS = 1e-5  # radius of a dot [object radii]: far above rounding, its lever arm far below any tolerance
 PAIR_DISTANCE = (
@@ -87,7 +98,19 @@ class EdgePairs:
     row: Int[np.ndarray, "edge_pairs"]
     finger: Int[np.ndarray, "edge_pairs"]
     normal: Float[np.ndarray, "edge_pairs 2"]  # in the object's frame
-    margin: float  # gap at which they act [m]
+
+
+@dataclass(frozen=True)
+class FacePairs:
+    """Pairs of a finger's dot and the faces of the other finger: that toward the object, and its back.
+
+    `row` has MuJoCo's pairs with either face, `finger` (0 or 1) is the one with the faces and `dot` the other one's
+    place in its own frame, whose x-axis is the finger.
+    """
+
+    row: Int[np.ndarray, "dots 2"]
+    finger: Int[np.ndarray, "dots"]
+    dot: Float[np.ndarray, "dots 2"]
 
 
 @dataclass(frozen=True)
@@ -96,19 +119,21 @@ class MujocoModel:
 
     `pair[geom1, geom2]` is the row of `names`, or after them of `link_meetings`, that two shapes belong to (-1: none);
     `toward[row]` is 1 where MuJoCo's contact normal points into the object and -1 where it points out of it. Each row
-    of `names` has its `link` and its `friction` coefficient; `joint` are the fingers' joints [m], and `mobility` is the
-    diagonal of `M^-1`. `xml` is the model as MJCF, always with MuJoCo's friction.
+    of `names` has its `link` and its `friction` coefficient; `gap` is that at which pairs begin to act [m]; `hand` is
+    the scene's, and `mobility` the diagonal of `M^-1`. `xml` is the model as MJCF, always with MuJoCo's friction.
     """
 
     model: mujoco.MjModel
     names: tuple[str, ...]
     edges: EdgePairs
+    faces: FacePairs
+    gap: float
     link_meetings: tuple[str, ...]
     pair: Int[np.ndarray, "geoms geoms"]
     toward: Int[np.ndarray, "rows"]
     link: Int[np.ndarray, "rows"]
     friction: Float[np.ndarray, "rows"]
-    joint: Float[np.ndarray, "2 2"]
+    hand: Hand
     mobility: Float[np.ndarray, "5"]
     softness: ContactCompliance
     xml: str
@@ -116,13 +141,13 @@ class MujocoModel:
 
 def build_mujoco_model(scene: Scene, timestep: float, softness: ContactCompliance = ContactCompliance()) -> MujocoModel:
     """Build the model of a scene for time steps of `timestep` [s]."""
-    solid = jax.tree.map(np.asarray, rigid_body(scene.object))
+    solid, hand = jax.tree.map(np.asarray, (rigid_body(scene.object), scene.hand))
     size = float(np.sqrt((solid.vertices[: solid.count] ** 2).sum(1).max()))
     spec = _world(scene, timestep, softness)
     _add_object(spec, solid, size)
     _add_hand(spec, scene.hand, size, _gives_way(softness, timestep))
     rows = _add_pairs(spec, solid, size, timestep, softness)
-    meetings = _add_link_pairs(spec, scene, size, timestep, softness)
+    meetings = _add_link_pairs(spec, hand, size, timestep, softness)
     model = spec.compile()
     if softness.friction == "coulomb":
         model.pair_dim[:] = 1  # normal forces alone
@@ -137,40 +162,72 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
         first, second = model.geom(one).id, model.geom(other).id
         pair[first, second] = pair[second, first] = len(rows) + link_meetings.index(name)
     link = np.array([parse_contact(name)[0] for name in rows])
-    inertia = np.array([solid.mass, solid.mass, solid.inertia, *np.asarray(scene.hand.inertia)])
-    return MujocoModel(
+    inertia = np.array([solid.mass, solid.mass, solid.inertia, *hand.inertia])
+    bodies = MujocoModel(
         model=model,
         names=tuple(rows),
-        edges=_edge_pairs(model, tuple(rows), solid, PAIR_DISTANCE * size),
+        edges=_edge_pairs(model, tuple(rows), solid),
+        faces=_face_pairs(model, hand),
+        gap=PAIR_DISTANCE * size,
         link_meetings=link_meetings,
         pair=pair,
         toward=toward,
         link=link,
         friction=np.asarray(solid.friction)[link],
-        joint=np.asarray(scene.hand.joint),
+        hand=hand,
         mobility=1 / inertia,
         softness=softness,
         xml=spec.to_xml(),
     )
+    _choose_faces(bodies, np.asarray(scene.start)[3:], everywhere=True)
+    return bodies
 
 
-def _edge_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid, margin: float) -> EdgePairs:
+def _edge_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid) -> EdgePairs:
     corners = solid.vertices[: solid.count]
     along = np.roll(corners, -1, 0) - corners
     parsed = [(name, *parse_contact(name)[:3]) for name in names]
     found = [(model.pair(name).id, link - 1, feature) for name, link, kind, feature in parsed if kind == EDGE]
     row, finger, feature = np.array(found).T
-    return EdgePairs(row, finger, np.stack([along[feature, 1], -along[feature, 0]], axis=1), margin)
+    return EdgePairs(row, finger, np.stack([along[feature, 1], -along[feature, 0]], axis=1))
 
 
-def choose_edges(bodies: MujocoModel, data: mujoco.MjData) -> None:
-    """Leave out, for the next step, fingertips against edges from whose inner side their fingers come."""
+def _face_pairs(model: mujoco.MjModel, hand) -> FacePairs:
+    dots = [] if hand.layered else [(k, name, at) for k in (0, 1) for name, at in _dots(hand, k)]
+    rows = [[model.pair(f"{name} on {face}").id for face in _faces(1 - k)] for k, name, _ in dots]
+    return FacePairs(
+        np.array(rows, int).reshape(-1, 2),
+        np.array([1 - k for k, _, _ in dots], int),
+        np.array([at for _, _, at in dots], float).reshape(-1, 2),
+    )
+
+
+def choose_pairs(bodies: MujocoModel, data: mujoco.MjData) -> None:
+    """Leave out, for the next step, pairs of which a shape's thickness would be met, not what it stands for."""
     _, _, phi, *angles = data.qpos
     normal, toward_tip = bodies.edges.normal, np.array(angles)[bodies.edges.finger] - phi
     from_outside = normal[:, 0] * np.cos(toward_tip) + normal[:, 1] * np.sin(toward_tip) <= 0
-    bodies.model.pair_margin[bodies.edges.row] = np.where(
-        from_outside, bodies.edges.margin, -FAR_BELOW * bodies.edges.margin
-    )
+    _act(bodies, bodies.edges.row, from_outside)
+    if len(bodies.faces.row):
+        _choose_faces(bodies, np.array(angles))
+
+
+def _choose_faces(bodies: MujocoModel, angles: Float[np.ndarray, "2"], everywhere: bool = False) -> None:
+    """Let dots that are beyond the other finger's end, or all, meet that of its faces on whose side they are."""
+    hand, faces = bodies.hand, bodies.faces
+    along = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    other, finger = 1 - faces.finger, faces.finger
+    dot = hand.joint[other] + faces.dot[:, :1] * along[other] + faces.dot[:, 1:] * across[other] - hand.joint[finger]
+    height = np.array([1.0, -1.0])[finger] * (dot * across[finger]).sum(1)  # toward the object
+    beyond = everywhere | ((dot * along[finger]).sum(1) > hand.length[finger])
+    before = height > (hand.offset - hand.back)[finger] / 2
+    _act(bodies, faces.row[beyond], np.stack([before, ~before], axis=1)[beyond])
+
+
+def _act(bodies: MujocoModel, rows: Int[np.ndarray, "..."], whether: Bool[np.ndarray, "..."]) -> None:
+    """Let pairs act at their gap, or not at all."""
+    bodies.model.pair_margin[rows] = np.where(whether, bodies.gap, -FAR_BELOW * bodies.gap)
 
 
 def _world(scene, timestep, softness):
@@ -291,16 +348,14 @@ def _gives_way(softness: ContactCompliance, timestep: float) -> dict[str, list[f
     return {"solref": [softness.time_constant * timestep, 1.0], "solimp": [d, d, 1e-3, 0.5, 2]}
 
 
-def _add_link_pairs(spec, scene, size, timestep, softness) -> list[tuple[str, str, str]]:
+def _add_link_pairs(spec, hand, size, timestep, softness) -> list[tuple[str, str, str]]:
     """Declare the pairs of links that may meet: (what meets, the dot, the slab)."""
-    hand, meetings = jax.tree.map(np.asarray, scene.hand), []
+    meetings = []
     for k, name in enumerate(LINKS[1:]):
-        other = LINKS[2 - k]
-        tips = [f"{name}_tip", f"{name}_back_tip"][: 1 if hand.offset[k] + hand.back[k] == 0 else 2]
-        meetings += [(f"{name} meets the palm", tip, "palm") for tip in tips]
+        dots = [dot for dot, _ in _dots(hand, k)]
+        meetings += [(f"{name} meets the palm", tip, "palm") for tip in dots[1:]]
         if not hand.layered:
-            slab = other if _starts_before(hand, k, np.asarray(scene.start)[3:]) else f"{other}_back"
-            meetings += [("finger1 meets finger2", dot, slab) for dot in (*tips, f"{name}_joint")]
+            meetings += [("finger1 meets finger2", dot, face) for dot in dots for face in _faces(1 - k)]
     for _, dot, slab in meetings:
         spec.add_pair(
             name=f"{dot} on {slab}",
@@ -313,12 +368,18 @@ def _add_link_pairs(spec, scene, size, timestep, softness) -> list[tuple[str, st
     return meetings
 
 
-def _starts_before(hand, k: int, angles) -> bool:
-    """Whether a finger's tip is on that side of the other finger on which the object is."""
-    other, side = 1 - k, (1.0, -1.0)[1 - k]
-    tip = hand.joint[k] + hand.length[k] * np.array([np.cos(angles[k]), np.sin(angles[k])]) - hand.joint[other]
-    across = side * np.array([-np.sin(angles[other]), np.cos(angles[other])])
-    return bool(tip @ across > (hand.offset[other] - hand.back[other]) / 2)
+def _dots(hand, k: int) -> list[tuple[str, tuple[float, float]]]:
+    """Return the names and places, in the finger's frame, of what may meet another link: its joint and tips."""
+    name, side = LINKS[1 + k], (1.0, -1.0)[k]
+    dots = [(f"{name}_joint", (0.0, 0.0)), (f"{name}_tip", (hand.length[k], side * hand.offset[k]))]
+    if hand.offset[k] + hand.back[k] != 0:
+        dots.append((f"{name}_back_tip", (hand.length[k], -side * hand.back[k])))
+    return dots
+
+
+def _faces(k: int) -> tuple[str, str]:
+    """Return the names of a finger's slabs, toward the object and away from it."""
+    return LINKS[1 + k], f"{LINKS[1 + k]}_back"
 
 
 def _wedges(corners, behind):

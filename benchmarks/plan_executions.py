@@ -1,0 +1,120 @@
+"""Do planned motions work? Goals on random parts, planned, optimised and executed by free bodies in MuJoCo.
+
+    python benchmarks/plan_executions.py [--plans 50] [--regrasps 50] [--seconds 4] [--quick]
+
+Parts, hands and goals are those of `planning.py`, turns by 45 to 90 degrees with regrasps; each part on each hand is
+asked one goal after the other. The best plan that is found is optimised, each phase in a second, and executed at the
+default time step. An execution succeeds within 0.5 mm and 0.01 rad of the predicted end, the last contacts closed and
+no link met that should not be. Prints and writes how many plans are optimised, how many executions succeed, and what
+became of the others.
+"""
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+from measure import save
+from planning import GOALS, HANDS, at_rest, objects
+
+import wholearm_jax as wa
+from wholearm_jax.core import Status
+from wholearm_jax.ensembles import wilson_interval
+from wholearm_jax.execution import ExecutionOutcome, execute
+
+TURNS = {f"turn {a} deg": {"phi": -np.radians(a)} for a in (45, 60, 75, 90)}
+REGRASP_COST = 1.0
+
+
+def plans(seconds: float, seed: int, regrasp_cost: float | None) -> Iterator[tuple[dict, wa.Scene]]:
+    """Yield plans for one goal after the other, without end; with regrasps, those alone that have one."""
+    rng = np.random.default_rng(seed)
+    goals = GOALS if regrasp_cost is None else TURNS
+    while True:
+        for kind, shape in objects(rng, 1):
+            for hand, (joint, length) in HANDS.items():
+                scene, goal = at_rest(shape, joint, length), str(rng.choice(list(goals)))
+                if scene is None:
+                    continue
+                result = wa.plan(scene, by=goals[goal], count=1, time_limit=seconds, regrasp_cost=regrasp_cost)
+                if result.found and (regrasp_cost is None or any(step.regrasp for step in result.plans[0].steps)):
+                    plan = result.plans[0]
+                    about = {"kind": kind, "hand": hand, "goal": goal, "bound": plan.bound, "phases": len(plan.steps)}
+                    yield about, plan.scene
+
+
+def carry_out(scene: wa.Scene) -> dict:
+    """Optimise a plan and execute it."""
+    begun = time.perf_counter()
+    optimum = wa.optimise(scene)
+    found = {
+        "status": optimum.result.status.name.lower(),
+        "message": optimum.result.message,
+        "margin": float(optimum.result.margin),
+        "optimise_seconds": time.perf_counter() - begun,
+    }
+    if optimum.result.status != Status.OK:
+        return found
+    execution = execute(optimum.result)
+    return found | {
+        "ending": execution.ending.value,
+        "execution": execution.message,
+        "position_error": execution.position_error,
+        "angle_error": abs(execution.angle_error),
+    }
+
+
+def measure(count: int, seconds: float, seed: int, regrasp_cost: float | None) -> list[dict]:
+    """Carry out so many plans."""
+    rows = []
+    for about, scene in plans(seconds, seed, regrasp_cost):
+        if len(rows) == count:
+            break
+        rows.append(about | carry_out(scene))
+        row = rows[-1]
+        print(
+            f"{row['kind']}, {row['hand']}, {row['goal']}: {row.get('execution', row['message'])}",
+            flush=True,
+        )
+    return rows
+
+
+def report(label: str, rows: list[dict]) -> None:
+    """Print how many succeed, and what became of the others."""
+    endings = Counter(row.get("ending", "not executed: " + row["status"]) for row in rows)
+    succeed = endings.pop(ExecutionOutcome.OK.value, 0)
+    low, high = wilson_interval(succeed, len(rows))
+    others = ", ".join(f"{count} {why}" for why, count in endings.most_common()) or "no other"
+    errors = [row["position_error"] for row in rows if "position_error" in row]
+    print(
+        f"{label}: {succeed} of {len(rows)} executions succeed ({100 * low:.0f} to {100 * high:.0f} %); {others};"
+        f" {1e3 * np.median(errors):.3g} mm from the predicted end in the median"
+    )
+
+
+def main() -> None:
+    wa.configure()
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--plans", type=int, default=50, help="without regrasps")
+    parser.add_argument("--regrasps", type=int, default=50, help="plans with regrasps")
+    parser.add_argument("--seconds", type=float, default=4.0, help="to plan for each goal")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--quick", action="store_true", help="one plan, half a second; nothing is written")
+    given = parser.parse_args()
+    counts = {"without regrasps": (given.plans, None), "with regrasps": (given.regrasps, REGRASP_COST)}
+    if given.quick:
+        counts = {"without regrasps": (1, None)}
+    found = {
+        label: measure(count, 0.5 if given.quick else given.seconds, given.seed, cost)
+        for label, (count, cost) in counts.items()
+        if count
+    }
+    for label, rows in found.items():
+        report(label, rows)
+    if not given.quick:
+        save("plan_executions", found)
+
+
+if __name__ == "__main__":
+    main()
