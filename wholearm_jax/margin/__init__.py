@@ -20,5 +20,12 @@ from wholearm_jax.margin.quasistatic import (
     best_quasistatic_torque_batch,
 )
 from wholearm_jax.margin.rest_interval import RestInterval, rest_margin, schedule_corners
-from wholearm_jax.margin.statics import MARGIN_TIE, RestAccelerations, Statics, contact_statics, without_joint
+from wholearm_jax.margin.statics import (
+    MARGIN_TIE,
+    RestAccelerations,
+    StaticMargin,
+    Statics,
+    contact_statics,
+    without_joint,
+)
 from wholearm_jax.margin.upper_bound import BOUND_PLACES, BOUND_SPEEDS, MAX_SPEED_RATIO, MarginBound, margin_upper_bound

@@ -1,8 +1,8 @@
 """Advice on a plan that fails: the cause of each phase's failure, and what helps against that cause.
 
-Causes are looked for in this order: a negative bound (no torque holds the contacts somewhere on the path, however
-slowly), torque limits (no motion keeps them, however long it takes), too little time, and last torques that do not
-reach what a motion along the path can.
+Causes are looked for in this order: a hand-over that no torque survives, a negative bound (no torque holds the contacts
+somewhere on the path, however slowly), torque limits (no motion keeps them, however long it takes), too little time,
+and last torques that do not reach what a motion along the path can.
 """
 
 import math
@@ -21,10 +21,11 @@ from wholearm_jax.model import Arrival
 from wholearm_jax.optimisation.best_motion import shortest_motions
 from wholearm_jax.optimisation.quasistatic_plan import bounds
 from wholearm_jax.optimisation.singular_advice import explain_singular
-from wholearm_jax.phases import PhaseResult, Result, TracedPhase, configuration
+from wholearm_jax.phases import HandOver, PhaseResult, Result, TracedPhase, configuration, find_hand_overs
 
 REMEDY_BOUND = "lower the friction or raise the torque limits, turn the object another way, or choose other contacts"
 REMEDY_LIMITS = "raise the torque limits, lower the friction, or choose other contacts"
+REMEDY_HAND_OVER = "hand over elsewhere: choose other contacts, or fingers of another length"
 REMEDY_OPTIMISE = "`wholearm optimise` looks for torques that work"
 SPARE_TIME = 1.5  # a phase should have this much more time than its fastest motion takes
 MIN_KNOTS = 11  # fewer are too few for most phases
@@ -62,11 +63,14 @@ def explain(
     if not failed and not too_short:
         return result
     values = margin_bounds or bounds(result.scene, traced=traced)
-    searched = [k for k in failed if k not in too_short]
+    phases = list(result.phases)
+    impossible = _impossible_hand_overs(result, traced)
+    for k in impossible.keys() & set(failed):
+        phases[k] = _explain_hand_over(phases[k], impossible[k])
+    searched = [k for k in failed if k not in too_short and k not in impossible]
     refused = [k for k in searched if _no_torque_holds(result.phases[k], float(values[k].value))]
     open_ones = [k for k in searched if k not in refused and result.phases[k].arrive is not Arrival.HOLD]
     fastest = shortest_motions(result.scene, 0.0, traced=traced) if open_ones else (None,) * len(traced)
-    phases = list(result.phases)
     for k, shortest in too_short.items():
         detail, remedy = _explain_motion(k, phases[k], shortest, search)
         phases[k] = replace(phases[k], status=Status.TOO_SHORT, contact=None, slips=False, detail=detail, remedy=remedy)
@@ -96,6 +100,22 @@ def _fails_on_its_way(phase: PhaseResult) -> bool:
     """Whether a phase has a path, and torques fail it there."""
     has_path = int(phase.traced.dynamics.status) == Status.OK
     return has_path and phase.status not in (Status.OK, Status.OBSTACLE)
+
+
+def _impossible_hand_overs(result: Result, traced: tuple[TracedPhase, ...]) -> dict[int, HandOver]:
+    """Return the hand-over that no torque survives of each phase that begins or ends with one."""
+    found = {}
+    for k, hand_over in enumerate(find_hand_overs(result.scene, traced)):
+        if hand_over is not None and not hand_over.margin > 0:
+            found |= {k - 1: hand_over, k: hand_over}
+    return found
+
+
+def _explain_hand_over(phase: PhaseResult, hand_over: HandOver) -> PhaseResult:
+    """Name the contacts of a hand-over that no torque survives."""
+    old, new = (one.name for one in hand_over)
+    detail = f"{old} hands over to {new} there, and no torque holds and moves the object under either"
+    return replace(phase, detail=detail, remedy=REMEDY_HAND_OVER)
 
 
 def _no_torque_holds(phase: PhaseResult, bound: float) -> bool:

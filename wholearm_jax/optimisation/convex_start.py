@@ -17,7 +17,7 @@ from wholearm_jax.model import Phase, Scene, TorqueSchedule, concatenate_schedul
 from wholearm_jax.optimisation.best_motion import path_duration, path_margin
 from wholearm_jax.optimisation.initial_guess import UnitMotion
 from wholearm_jax.optimisation.quasistatic_plan import rolling_count
-from wholearm_jax.phases import TracedPhase, statics_at_start
+from wholearm_jax.phases import HandOver, TracedPhase, statics_at_start
 
 NEAR_MARGIN = 0.999  # fraction of the largest margin that the shortest sensible motion reaches
 GOOD_MOVING_TIME = 1.25  # time of a motion after a wait, over the shortest sensible one
@@ -39,7 +39,13 @@ class ConvexStart(NamedTuple):
 
 
 def convex_starts(
-    scene: Scene, phase: Phase, traced: TracedPhase, duration: float, knots: int, may_wait: bool
+    scene: Scene,
+    phase: Phase,
+    traced: TracedPhase,
+    duration: float,
+    knots: int,
+    may_wait: bool,
+    hand_over: HandOver | None = None,
 ) -> list[ConvexStart]:
     """Solve the convex programme of one phase from rest to rest.
 
@@ -50,6 +56,7 @@ def convex_starts(
         duration: of the phase [s].
         knots: torque knots of the phase.
         may_wait: whether the object may wait before it moves.
+        hand_over: with which the phase begins, if it does: either contact must hold an object that waits.
 
     Returns:
         The starts to try in turn: moving for the whole duration unless that is very long, then after a wait where there
@@ -71,8 +78,11 @@ def convex_starts(
     moving = GOOD_MOVING_TIME * float(sensible.duration)
     if not bool(sensible.converged) or duration <= moving:
         return starts
-    statics, accelerations = statics_at_start(scene, phase, traced)
-    hold = statics.most_central_torque(accelerations)
+    if hand_over is None:
+        statics, accelerations = statics_at_start(scene, phase, traced)
+        hold = statics.most_central_torque(accelerations)
+    else:
+        hold = hand_over.best_hold()
     if not hold.margin >= float(whole.margin):
         return starts
     waiting = ConvexStart(_unit_motion(optimum(moving), traced, knots), Wait(duration - moving, hold.torque))

@@ -62,10 +62,11 @@ from wholearm_jax.optimisation.coupled_phases import (
     MIN_DURATION_FRACTION,
     CoupledPhases,
     GroupSolution,
+    HandOvers,
     OptimiseOptions,
     solve_coupled_phases,
 )
-from wholearm_jax.optimisation.plan_limits import tighten_bounds, too_short_phases
+from wholearm_jax.optimisation.plan_limits import limit_by_hand_overs, tighten_bounds, too_short_phases
 from wholearm_jax.optimisation.plan_transitions import holding_schedule, rest_transitions
 from wholearm_jax.optimisation.precompilation import precompile_optimise, schedule_rows
 from wholearm_jax.optimisation.quasistatic_plan import bounds, require_knots
@@ -73,9 +74,11 @@ from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.optimisation.shortest_plan import shortest_plan
 from wholearm_jax.optimisation.solver import IterationRecord
 from wholearm_jax.phases import (
+    HandOver,
     Result,
     TracedPhase,
     build_result,
+    find_hand_overs,
     group_phases,
     idle_torques,
     simulate_phases,
@@ -110,6 +113,7 @@ class PlanLimits(NamedTuple):
 
     pointwise: tuple[MarginBound, ...]  # of each phase
     bounds: tuple[MarginBound, ...]  # the smaller of that and the convex one
+    hand_overs: list[HandOver | None]  # with which the phases begin
     too_short: dict[int, float]  # shortest duration [s] of each phase that has less time
 
 
@@ -194,9 +198,11 @@ def optimise(
     if durations is not None:
         longest = _with_durations(scene, durations[1])
     motions = convex_bounds(longest, traced=traced)
+    hand_overs = find_hand_overs(scene, traced)
     limits = PlanLimits(
         pointwise,
-        tighten_bounds(scene, pointwise, motions, traced),
+        limit_by_hand_overs(tighten_bounds(scene, pointwise, motions, traced), hand_overs, traced),
+        hand_overs,
         too_short_phases(longest, pointwise, motions, traced),
     )
 
@@ -260,15 +266,18 @@ def _solve_group(
         schedules = [uniform_schedule(float(phase.duration), np.zeros((options.knots, 2))) for phase in phases]
         return GroupSolution(schedules, f"phase '{scene.phases[short[0]].name}' is too short for any motion", [])
     margin_bounds: list[MarginBound] = [limits.bounds[k] for k in group]
+    around = (limits.hand_overs[group[0]], next(iter(limits.hand_overs[group[-1] + 1 :]), None))
+    hand_overs = HandOvers(*(None if over is None or not over.margin > 0 else over for over in around))
     starts: list[ConvexStart] = []
     if len(group) == 1 and int(paths[0].dynamics.status) == Status.OK and float(margin_bounds[0].value) > 0:
         may_wait = options.rate_limit is None and options.durations is None
         moving = float(phases[0].duration) - (ends[0].dwell_time if ends[0] is not None else 0.0)
-        starts = convex_starts(scene, phases[0], paths[0], moving, options.knots, may_wait)
+        starts = convex_starts(scene, phases[0], paths[0], moving, options.knots, may_wait, hand_overs.first)
     solutions: list[GroupSolution] = []
-    for convex in starts or [None]:
+    for convex, torques in itertools.product(starts or [None], hand_overs.torques_to_try()):
         only, tried = len(starts) <= 1, len(solutions)
-        coupled = CoupledPhases(group[0], phases, paths, margin_bounds, *ends, convex, only, tried, options)
+        more = (hand_overs, torques, only, tried, options)
+        coupled = CoupledPhases(group[0], phases, paths, margin_bounds, *ends, convex, *more)
         solutions.append(solve_coupled_phases(scene, coupled))
         if solutions[-1].score >= (True, 1 - options.tolerance):
             break

@@ -1,15 +1,18 @@
 """What no schedule can exceed: the bound of each phase's margin in its duration, and the shortest duration.
 
 The bound is the margin of the convex optimum, which covers motions of every speed. For a phase that is entered or left
-at speed, which cannot wait first, it is the pointwise one (`quasistatic_plan.bounds`) where that is smaller.
+at speed, which cannot wait first, it is the pointwise one (`quasistatic_plan.bounds`) where that is smaller. For one
+that begins with a hand-over that no torque survives, it is the hand-over's margin, which is negative.
 """
+
+from collections.abc import Sequence
 
 from wholearm_jax.core import as_device_array
 from wholearm_jax.margin import MarginBound
 from wholearm_jax.model import Arrival, Scene
 from wholearm_jax.optimisation.best_motion import BestMotion, convex_bounds, shortest_motions
 from wholearm_jax.optimisation.quasistatic_plan import bounds
-from wholearm_jax.phases import TracedPhase, starts_at_rest, trace
+from wholearm_jax.phases import HandOver, TracedPhase, find_hand_overs, starts_at_rest, trace
 
 
 def certified_bounds(
@@ -32,7 +35,8 @@ def certified_bounds(
     """
     traced = traced or trace(scene)
     pointwise = pointwise or bounds(scene, traced=traced)
-    return tighten_bounds(scene, pointwise, convex_bounds(scene, traced=traced), traced)
+    tighter = tighten_bounds(scene, pointwise, convex_bounds(scene, traced=traced), traced)
+    return limit_by_hand_overs(tighter, find_hand_overs(scene, traced), traced)
 
 
 def tighten_bounds(
@@ -59,6 +63,19 @@ def tighten_bounds(
         return MarginBound(*(as_device_array(a) for a in (motion.margin, s, motion.hardest_place)))
 
     return tuple(tighter(*row) for row in zip(pointwise, motions, traced, cannot_wait, strict=True))
+
+
+def limit_by_hand_overs(
+    margin_bounds: tuple[MarginBound, ...], hand_overs: Sequence[HandOver | None], traced: tuple[TracedPhase, ...]
+) -> tuple[MarginBound, ...]:
+    """Return the margin of a hand-over as the bound of the phase that begins with it, where that is not positive."""
+
+    def limited(bound: MarginBound, hand_over: HandOver | None, path: TracedPhase) -> MarginBound:
+        if hand_over is None or (margin := hand_over.margin) > 0:
+            return bound
+        return MarginBound(*(as_device_array(a) for a in (margin, path.dynamics.breakpoints[0], 0.0)))
+
+    return tuple(limited(*row) for row in zip(margin_bounds, hand_overs, traced, strict=True))
 
 
 def too_short_phases(

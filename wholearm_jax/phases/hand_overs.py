@@ -1,0 +1,200 @@
+r"""Hand-overs: where a vertex on a finger reaches its tip, the tip goes on along an edge, or the other way round.
+
+The object rests where one phase ends and the next begins, at a place at which the vertex and the tip coincide. Which of
+the two contacts holds it there is decided by less than a micrometre: the plan is carried out only where the torques do
+under either. So the torque with which it arrives, a little early or late, must press both contacts and brake it, the
+one that holds it must do so by either, and the one with which it starts must press both and move it on:
+
+    arrives:  c_n >= m,   a <= -`LEAST_ACCELERATION` L / T^2    at the end of the one path and at the start of the other
+    stays:    some forces within both sets of limits (`margin.statics`) with c_n >= m
+    starts:   c_n >= m,   a >= `LEAST_ACCELERATION` L / T^2
+
+All are linear in the torque and `m`: linear programmes.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from wholearm_jax.core import CachedJit, LinearProgramme, Status
+from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
+from wholearm_jax.margin import (
+    MARGIN_TIE,
+    RestAccelerations,
+    StaticMargin,
+    Statics,
+    cone_facets,
+    contact_statics,
+)
+from wholearm_jax.model import FEATURE_GROUPS, Arrival, Phase, Scene, feature_pair, parse_contact
+from wholearm_jax.phases.phase_ends import ends_at_stop
+from wholearm_jax.phases.phase_tracing import TracedPhase
+from wholearm_jax.tracing import PathEnd
+
+LEAST_ACCELERATION = 1.0  # with which the object starts under either contact [path lengths a duration^2]
+ROUNDING = 1e-6  # by which a torque's acceleration may fall short of the least
+MIN_REST_MARGIN = 0.01  # distance of torques at rest from those that would move the object, over the limits
+
+
+class OneContact(NamedTuple):
+    """The object at rest at a hand-over, held by one of the two contacts."""
+
+    name: str  # of the contact
+    statics: Statics
+    accelerations: RestAccelerations
+    slack: Float[np.ndarray, "facets 3"]  # of the forces of forward travel [N], linear in `(1, tau1, tau2)`
+    least: float  # acceleration with which it starts, in the unit of `accelerations`
+
+    def arrives(self, torque: Float[np.ndarray, "2"]) -> bool:
+        """Say whether forces press while the object arrives, or passes by a little."""
+        return bool((self.slack @ np.append(1.0, torque)).min() >= 0)
+
+    def starts(self, torque: Float[np.ndarray, "2"]) -> bool:
+        """Say whether the object stays, or starts forward with forces that press."""
+        load = np.append(1.0, torque)
+        if self.accelerations.behind @ load < 0:
+            return False
+        if self.accelerations.ahead @ load > 0:
+            return self.arrives(torque)
+        return self.statics.margin_under(torque).margin >= 0
+
+
+class HandOver(NamedTuple):
+    """A contact that takes over from another at the same point, at rest."""
+
+    before: OneContact
+    after: OneContact
+
+    @property
+    def margin(self) -> float:
+        """The least of the largest margins with which the object arrives, stays and starts [N]; negative: it cannot."""
+        return min(best.margin for best in (self.best_arrival(), self.best_hold(), self.best_start()))
+
+    def best_hold(self) -> StaticMargin:
+        """Compute the torque that holds the object by either contact with the largest margin."""
+        programme, limit = self._programme()
+        for prefix, one in zip(("before_", "after_"), self, strict=True):
+            press = self.before.statics.unit / one.statics.unit
+            one.statics.add_forces(programme, level="level", press=press, torque_unit=limit, prefix=prefix)
+            rows = one.accelerations.rest_rows(limit)
+            programme.at_most(prefix + "rest", -rows[:, 0] - MIN_REST_MARGIN, torque=rows[:, 1:], apart=1.0)
+        return self._central(programme)
+
+    def best_start(self) -> StaticMargin:
+        """Compute the torque with which the object starts under either contact with the largest margin."""
+        return self._best_motion(1.0)
+
+    def best_arrival(self) -> StaticMargin:
+        """Compute the torque with which the object arrives under either contact with the largest margin."""
+        return self._best_motion(-1.0)
+
+    def start_margin(self, torque: Float[np.ndarray, "2"]) -> float:
+        """Compute the least force [N] under either contact where the object starts; -inf where it does not."""
+        return self._motion_margin(torque, 1.0)
+
+    def arrival_margin(self, torque: Float[np.ndarray, "2"]) -> float:
+        """Compute the least force [N] under either contact where the object arrives; -inf where it is not braked."""
+        return self._motion_margin(torque, -1.0)
+
+    def _best_motion(self, sign: float) -> StaticMargin:
+        programme, limit = self._programme()
+        for prefix, one in zip(("before_", "after_"), self, strict=True):
+            slack = one.slack / self.before.statics.unit
+            programme.at_least(prefix + "forces", -slack[:, 0], torque=slack[:, 1:] * limit, level=-1.0)
+            ahead = sign * one.accelerations.ahead
+            by_torque = ahead[1:] * limit
+            size = np.linalg.norm(by_torque)
+            least = [(one.least - ahead[0]) / size]
+            programme.at_least(prefix + "acceleration", least, torque=by_torque[None] / size, apart=-1.0)
+        return self._central(programme)
+
+    def _motion_margin(self, torque: Float[np.ndarray, "2"], sign: float) -> float:
+        load = np.append(1.0, torque)
+        if any(sign * one.accelerations.ahead @ load < one.least * (1 - ROUNDING) for one in self):
+            return -np.inf
+        return float(min((one.slack @ load).min() for one in self))
+
+    def _programme(self) -> tuple[LinearProgramme, Float[np.ndarray, "2"]]:
+        """Begin a programme: torques over their limits, the margin over the unit of force, and distance from limits."""
+        programme = LinearProgramme()
+        programme.add_variables("torque", -np.ones(2), np.ones(2))
+        programme.add_variables("level", -np.inf, np.inf)
+        programme.add_variables("apart", 0.0, 0.0)
+        return programme, self.before.statics.torque_limit
+
+    def _central(self, programme: LinearProgramme) -> StaticMargin:
+        """Maximise the margin, then go as far as nearly this margin allows from torques that do otherwise."""
+        statics = self.before.statics
+        best = programme.maximise("level")
+        if best is None:
+            return StaticMargin(-np.inf, self.after.name, np.zeros(2))
+        level = float(best.values["level"][0])
+        programme.set_bounds("level", level - (1 - MARGIN_TIE) * abs(level), np.inf)
+        programme.set_bounds("apart", 0.0, 1.0)
+        central = programme.maximise("apart") or best
+        return StaticMargin(level * statics.unit, self.after.name, statics.torque_limit * central.values["torque"])
+
+
+def find_hand_overs(scene: Scene, traced: tuple[TracedPhase, ...]) -> list[HandOver | None]:
+    """Return for each phase the hand-over with which it begins, if any."""
+    pairs = zip(scene.phases[:-1], traced[:-1], scene.phases[1:], traced[1:], strict=True)
+    return [None, *(find_hand_over(scene, *pair) for pair in pairs)]
+
+
+def find_hand_over(
+    scene: Scene, before: Phase, path_before: TracedPhase, after: Phase, path_after: TracedPhase
+) -> HandOver | None:
+    """Return the hand-over between two phases; None where they do not change contacts at one point, at rest."""
+    names = hand_over_contacts(scene, before, path_before, after)
+    if names is None or int(path_after.dynamics.status) != Status.OK:
+        return None
+    sides = ((before, path_before, -1), (after, path_after, 0))
+    return HandOver(*(_one_contact(scene, name, *side) for name, side in zip(names, sides, strict=True)))
+
+
+def hand_over_contacts(scene: Scene, before: Phase, path: TracedPhase, after: Phase) -> tuple[str, str] | None:
+    """Name the contact that ends and the one that takes over from it at the same point, at rest; None without any."""
+    at_rest = before.arrive in (Arrival.AT_REST, Arrival.ANY_SPEED) and after.arrive is not Arrival.HOLD
+    if not at_rest or before.regrasp or after.regrasp or int(path.dynamics.status) != Status.OK:
+        return None
+    held, then = (tuple(map(feature_pair, phase.formation.names)) for phase in (before, after))
+    reason, index = int(path.path.end_reason), int(path.path.end_contact)
+    if reason == PathEnd.FEATURE_END:
+        old = held[before.formation.contact_of_row[index]]
+        link = parse_contact(old)[0]
+    elif reason == PathEnd.CONTACT_MADE and not ends_at_stop(scene, before, path):
+        link = FEATURE_GROUPS[index // scene.object.vertices.shape[0]][0]
+    else:
+        return None
+    gone = [name for name in held if parse_contact(name)[0] == link and name not in then]
+    new = [name for name in then if parse_contact(name)[0] == link and name not in held]
+    return (gone[0], new[0]) if gone and new else None
+
+
+def _one_contact(scene: Scene, name: str, phase: Phase, path: TracedPhase, end: int) -> OneContact:
+    """Return the object at an end (0 or -1) of a phase's path."""
+    dynamics = path.dynamics
+    forward, backward, slack = jax.device_get(_terms_at_end(dynamics, jnp.asarray(end)))
+    z = path.begin if end == 0 else path.end
+    return OneContact(
+        name=name,
+        statics=contact_statics(scene, phase.formation, z),
+        accelerations=RestAccelerations(forward, backward),
+        slack=slack,
+        least=LEAST_ACCELERATION * float(dynamics.length) / float(phase.duration) ** 2,
+    )
+
+
+@CachedJit
+def _terms_at_end(dynamics: PathDynamics, end) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "facets 3"]]:
+    """Return accelerations, forward and backward, and slacks of forces at rest, linear in `(1, tau1, tau2)`."""
+    segment = jnp.where(end == 0, 0, dynamics.count - 1)
+    s = jnp.where(end == 0, dynamics.breakpoints[0], dynamics.breakpoints[-1])
+    panel, xi = locate_panel(dynamics, segment, s)
+    at_rest = jnp.array([0, 3, 4])
+    slack = cone_facets(dynamics, evaluate(dynamics.force, panel, xi))
+    forward = evaluate(dynamics.acceleration, panel, xi)
+    return forward[at_rest], evaluate(dynamics.reverse_acceleration, panel, xi), slack[:, at_rest]
