@@ -6,8 +6,9 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.execution import IDEAL
+from wholearm_jax.execution.acting_pairs import choose_pairs
 from wholearm_jax.execution.executions import execute
-from wholearm_jax.execution.mujoco_model import build_mujoco_model, choose_pairs
+from wholearm_jax.execution.mujoco_model import build_mujoco_model
 from wholearm_jax.feedback import feedback
 from wholearm_jax.feedback.path_table import path_terms, tabulate_path
 from wholearm_jax.phases import ends_at_stop
@@ -63,9 +64,9 @@ def test_a_fingertip_meets_an_edge_from_its_outer_side_alone(box):
 
     def touching(deeper, filtered):
         data.qpos[:] = corner + np.array([0, 0, 0, 0, deeper])
-        bodies.model.pair_margin[bodies.edges.row] = bodies.gap
+        bodies.model.pair_margin[bodies.acting.edges.row] = bodies.acting.gap
         if filtered:
-            choose_pairs(bodies, data)
+            choose_pairs(bodies.model, bodies.acting, data.qpos)
         mujoco.mj_step1(bodies.model, data)
         acting = data.contact.geom[data.contact.efc_address >= 0]
         return {bodies.names[bodies.pair[a, b]] for a, b in acting if bodies.pair[a, b] < len(bodies.names)}

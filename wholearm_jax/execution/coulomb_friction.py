@@ -21,7 +21,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from wholearm_jax.execution.mujoco_model import MujocoModel, choose_pairs
+from wholearm_jax.execution.acting_pairs import choose_pairs
+from wholearm_jax.execution.mujoco_model import MujocoModel
 
 EXACT, ROUNDS = 1e-6, 100  # when to stop: share of the largest friction by which forces still change; rounds at most
 
@@ -37,16 +38,25 @@ def advance(
     several contacts is not determined), and much where no forces agree with that law, as there need not be any if
     friction is large.
     """
-    choose_pairs(bodies, data)
+    if has_given_up(data):
+        return np.full_like(before, np.nan), np.inf
+    choose_pairs(bodies.model, bodies.acting, data.qpos)
     mujoco.mj_step1(bodies.model, data)
     data.ctrl[:] = torque
     pair, address, rows = _touching(bodies, data)
     friction, wrong = _settled(bodies, data, pair, address, rows, before[pair, 1], push)
     data.qfrc_applied[:] = friction @ rows + push
     mujoco.mj_step2(bodies.model, data)
+    if has_given_up(data):  # it has begun anew, and its contacts are others
+        return np.full_like(before, np.nan), np.inf
     forces = np.zeros_like(before)
     np.add.at(forces, pair, np.stack([data.efc_force[address], friction], axis=1))
     return forces, wrong
+
+
+def has_given_up(data) -> bool:
+    """Whether the motion became unstable, at this step or before."""
+    return any(warning.number for warning in data.warning)
 
 
 def _settled(bodies: MujocoModel, data, pair, address, rows, ct, push) -> tuple[Float[np.ndarray, "touching"], float]:

@@ -23,14 +23,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from wholearm_jax.core import Status, require_positive
+from wholearm_jax.execution.acting_pairs import choose_pairs
 from wholearm_jax.execution.closed_loop import (
     ControlledMotor,
     Hardware,
     closed_loop_step,
 )
-from wholearm_jax.execution.coulomb_friction import advance
+from wholearm_jax.execution.coulomb_friction import advance, has_given_up
 from wholearm_jax.execution.link_meetings import record_meetings, unexpected_meetings
-from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model, choose_pairs
+from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
 from wholearm_jax.execution.pushes import Push, push_force
 from wholearm_jax.feedback import Controller, planned_motion
 from wholearm_jax.model import (
@@ -280,8 +281,7 @@ def rollout(bodies: MujocoModel, start, torques: Float[np.ndarray, "steps 2"] | 
     z.append(data.qpos.copy())
     z_dot.append(data.qvel.copy())
     forces.append(step(bodies, data, last, found)[0])  # beyond the end, for the forces there
-    gave_up = any(warning.number for warning in data.warning)
-    return np.array(z), np.array(z_dot), np.array(forces), np.inf if gave_up else creep, met
+    return np.array(z), np.array(z_dot), np.array(forces), np.inf if has_given_up(data) else creep, met
 
 
 def _scheduled_motor(torques: Float[np.ndarray, "steps 2"]) -> Motor:
@@ -295,7 +295,7 @@ def stepper(bodies: MujocoModel) -> Callable:
 
 
 def _advance(bodies: MujocoModel, data: mujoco.MjData, torque, before, push=0.0):
-    choose_pairs(bodies, data)
+    choose_pairs(bodies.model, bodies.acting, data.qpos)
     data.ctrl[:] = torque
     data.qfrc_applied[:] = push
     mujoco.mj_step(bodies.model, data)  # its contacts are those of the state before the step

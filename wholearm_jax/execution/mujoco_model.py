@@ -21,6 +21,15 @@ contacts sag under a load of five weights: 18 micrometres at a step of 0.2 ms, 1
 The links are bodies among themselves, too: fingertips and joints are dots against the other finger, and fingertips
 against the palm, without friction; ranges are joint limits. Layered fingers do not meet.
 
+Slabs are thicker than what they stand for: which pairs act is chosen before every step (`acting_pairs`).
+
+A vertex under load is a little inside the finger, and so is the tip inside the object when the vertex passes it, where
+no edge's wedge would catch it. So a finger's face goes on beyond its tip (`_tip_extension`), by ten times of what
+contacts sag under a load of five weights: 18 micrometres at a step of 0.2 ms, 1 at 0.05 ms.
+
+The links are bodies among themselves, too: fingertips and joints are dots against the other finger, and fingertips
+against the palm, without friction; ranges are joint limits. Layered fingers do not meet.
+
 Slabs are thicker than what they stand for, so two kinds of pairs act only where they should (`choose_pairs`, before
 every step). A fingertip touches an edge only where its finger comes from the edge's outer side: from the inner side the
 finger meets an end of the edge first, and a tip that slips past that vertex, a little inside it, would catch on the
@@ -44,8 +53,9 @@ from typing import Literal
 import jax
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
+from wholearm_jax.execution.acting_pairs import ActingPairs, acting_pairs, choose_pairs, link_dots, link_faces
 from wholearm_jax.model import (
     EDGE,
     LINKS,
@@ -62,7 +72,6 @@ POINT_RADIUS = 1e-5  # radius of a dot [object radii]: far above rounding, its l
 PAIR_DISTANCE = (
     1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
 )
-FAR_BELOW = 1e9  # how far below its margin a contact that is left out would act
 TIP_LOAD, TIP_SAGS = 50.0, 10.0  # a finger's face goes on beyond its tip by so many sags under so much [m/s^2],
 MAX_TIP = 1e-3  # at most by this [object radii]
 HALF_SPACE_DEPTH = 0.2  # slabs, and all shapes in depth [object radii]
@@ -98,42 +107,18 @@ CONVEX = ContactCompliance(impedance=0.5, friction="convex")
 
 
 @dataclass(frozen=True)
-class EdgePairs:
-    """Pairs of a fingertip and an edge: rows of MuJoCo's pairs, fingers (0 or 1), and the edges' outward normals."""
-
-    row: Int[np.ndarray, "edge_pairs"]
-    finger: Int[np.ndarray, "edge_pairs"]
-    normal: Float[np.ndarray, "edge_pairs 2"]  # in the object's frame
-
-
-@dataclass(frozen=True)
-class FacePairs:
-    """Pairs of a finger's dot and the faces of the other finger: that toward the object, and its back.
-
-    `row` has MuJoCo's pairs with either face, `finger` (0 or 1) is the one with the faces and `dot` the other one's
-    place in its own frame, whose x-axis is the finger.
-    """
-
-    row: Int[np.ndarray, "dots 2"]
-    finger: Int[np.ndarray, "dots"]
-    dot: Float[np.ndarray, "dots 2"]
-
-
-@dataclass(frozen=True)
 class MujocoModel:
     """A compiled model, the names of its contacts, and what Coulomb's friction needs of both.
 
     `pair[geom1, geom2]` is the row of `names`, or after them of `link_meetings`, that two shapes belong to (-1: none);
     `toward[row]` is 1 where MuJoCo's contact normal points into the object and -1 where it points out of it. Each row
-    of `names` has its `link` and its `friction` coefficient; `gap` is that at which pairs begin to act [m]; `hand` is
-    the scene's, and `mobility` the diagonal of `M^-1`. `xml` is the model as MJCF, always with MuJoCo's friction.
+    of `names` has its `link` and its `friction` coefficient; `acting` says which pairs act when; `hand`
+    is the scene's, and `mobility` the diagonal of `M^-1`. `xml` is the model as MJCF, always with MuJoCo's friction.
     """
 
     model: mujoco.MjModel
     names: tuple[str, ...]
-    edges: EdgePairs
-    faces: FacePairs
-    gap: float
+    acting: ActingPairs
     link_meetings: tuple[str, ...]
     pair: Int[np.ndarray, "geoms geoms"]
     toward: Int[np.ndarray, "rows"]
@@ -169,12 +154,12 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
         pair[first, second] = pair[second, first] = len(rows) + link_meetings.index(name)
     link = np.array([parse_contact(name)[0] for name in rows])
     inertia = np.array([solid.mass, solid.mass, solid.inertia, *hand.inertia])
-    bodies = MujocoModel(
+    acting = acting_pairs(model, tuple(rows), solid, hand, PAIR_DISTANCE * size)
+    choose_pairs(model, acting, np.asarray(scene.start), everywhere=True)
+    return MujocoModel(
         model=model,
         names=tuple(rows),
-        edges=_edge_pairs(model, tuple(rows), solid),
-        faces=_face_pairs(model, hand),
-        gap=PAIR_DISTANCE * size,
+        acting=acting,
         link_meetings=link_meetings,
         pair=pair,
         toward=toward,
@@ -185,55 +170,6 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
         softness=softness,
         xml=spec.to_xml(),
     )
-    _choose_faces(bodies, np.asarray(scene.start)[3:], everywhere=True)
-    return bodies
-
-
-def _edge_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid) -> EdgePairs:
-    corners = solid.vertices[: solid.count]
-    along = np.roll(corners, -1, 0) - corners
-    parsed = [(name, *parse_contact(name)[:3]) for name in names]
-    found = [(model.pair(name).id, link - 1, feature) for name, link, kind, feature in parsed if kind == EDGE]
-    row, finger, feature = np.array(found).T
-    return EdgePairs(row, finger, np.stack([along[feature, 1], -along[feature, 0]], axis=1))
-
-
-def _face_pairs(model: mujoco.MjModel, hand) -> FacePairs:
-    dots = [] if hand.layered else [(k, name, at) for k in (0, 1) for name, at in _dots(hand, k)]
-    rows = [[model.pair(f"{name} on {face}").id for face in _faces(1 - k)] for k, name, _ in dots]
-    return FacePairs(
-        np.array(rows, int).reshape(-1, 2),
-        np.array([1 - k for k, _, _ in dots], int),
-        np.array([at for _, _, at in dots], float).reshape(-1, 2),
-    )
-
-
-def choose_pairs(bodies: MujocoModel, data: mujoco.MjData) -> None:
-    """Leave out, for the next step, pairs of which a shape's thickness would be met, not what it stands for."""
-    _, _, phi, *angles = data.qpos
-    normal, toward_tip = bodies.edges.normal, np.array(angles)[bodies.edges.finger] - phi
-    from_outside = normal[:, 0] * np.cos(toward_tip) + normal[:, 1] * np.sin(toward_tip) <= 0
-    _act(bodies, bodies.edges.row, from_outside)
-    if len(bodies.faces.row):
-        _choose_faces(bodies, np.array(angles))
-
-
-def _choose_faces(bodies: MujocoModel, angles: Float[np.ndarray, "2"], everywhere: bool = False) -> None:
-    """Let dots that are beyond the other finger's end, or all, meet that of its faces on whose side they are."""
-    hand, faces = bodies.hand, bodies.faces
-    along = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    other, finger = 1 - faces.finger, faces.finger
-    dot = hand.joint[other] + faces.dot[:, :1] * along[other] + faces.dot[:, 1:] * across[other] - hand.joint[finger]
-    height = np.array([1.0, -1.0])[finger] * (dot * across[finger]).sum(1)  # toward the object
-    beyond = everywhere | ((dot * along[finger]).sum(1) > hand.length[finger])
-    before = height > (hand.offset - hand.back)[finger] / 2
-    _act(bodies, faces.row[beyond], np.stack([before, ~before], axis=1)[beyond])
-
-
-def _act(bodies: MujocoModel, rows: Int[np.ndarray, "..."], whether: Bool[np.ndarray, "..."]) -> None:
-    """Let pairs act at their gap, or not at all."""
-    bodies.model.pair_margin[rows] = np.where(whether, bodies.gap, -FAR_BELOW * bodies.gap)
 
 
 def _world(scene, timestep, softness):
@@ -364,10 +300,10 @@ def _add_link_pairs(spec, hand, size, timestep, softness) -> list[tuple[str, str
     """Declare the pairs of links that may meet: (what meets, the dot, the slab)."""
     meetings = []
     for k, name in enumerate(LINKS[1:]):
-        dots = [dot for dot, _ in _dots(hand, k)]
+        dots = [dot for dot, _ in link_dots(hand, k)]
         meetings += [(f"{name} meets the palm", tip, "palm") for tip in dots[1:]]
         if not hand.layered:
-            meetings += [("finger1 meets finger2", dot, face) for dot in dots for face in _faces(1 - k)]
+            meetings += [("finger1 meets finger2", dot, face) for dot in dots for face in link_faces(1 - k)]
     for _, dot, slab in meetings:
         spec.add_pair(
             name=f"{dot} on {slab}",
@@ -378,20 +314,6 @@ def _add_link_pairs(spec, hand, size, timestep, softness) -> list[tuple[str, str
             **_gives_way(softness, timestep),
         )
     return meetings
-
-
-def _dots(hand, k: int) -> list[tuple[str, tuple[float, float]]]:
-    """Return the names and places, in the finger's frame, of what may meet another link: its joint and tips."""
-    name, side = LINKS[1 + k], (1.0, -1.0)[k]
-    dots = [(f"{name}_joint", (0.0, 0.0)), (f"{name}_tip", (hand.length[k], side * hand.offset[k]))]
-    if hand.offset[k] + hand.back[k] != 0:
-        dots.append((f"{name}_back_tip", (hand.length[k], -side * hand.back[k])))
-    return dots
-
-
-def _faces(k: int) -> tuple[str, str]:
-    """Return the names of a finger's slabs, toward the object and away from it."""
-    return LINKS[1 + k], f"{LINKS[1 + k]}_back"
 
 
 def _wedges(corners, behind):

@@ -22,6 +22,7 @@ from wholearm_jax.margin.quasistatic import (
 from wholearm_jax.margin.rest_interval import RestInterval, rest_margin, schedule_corners
 from wholearm_jax.margin.statics import (
     MARGIN_TIE,
+    MIN_REST_MARGIN,
     RestAccelerations,
     StaticMargin,
     Statics,

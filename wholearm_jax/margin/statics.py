@@ -29,6 +29,7 @@ from wholearm_jax.model import (
 
 MARGIN_CAP = 1e6  # the largest margin, over the unit of force: friction may let forces grow without end
 NO_ROWS = np.zeros((0, 3))
+MIN_REST_MARGIN = 0.01  # distance of torques at rest from those that would move the object, over the limits
 MARGIN_TIE = 0.99  # fraction of the best margin that a torque farther from those that move the object may keep
 
 

@@ -25,7 +25,7 @@ from wholearm_jax.phases import HandOver, PhaseResult, Result, TracedPhase, conf
 
 REMEDY_BOUND = "lower the friction or raise the torque limits, turn the object another way, or choose other contacts"
 REMEDY_LIMITS = "raise the torque limits, lower the friction, or choose other contacts"
-REMEDY_HAND_OVER = "hand over elsewhere: choose other contacts, or fingers of another length"
+REMEDY_LOST_HAND_OVER = "hand over elsewhere: choose other contacts, or fingers of another length"
 REMEDY_OPTIMISE = "`wholearm optimise` looks for torques that work"
 SPARE_TIME = 1.5  # a phase should have this much more time than its fastest motion takes
 MIN_KNOTS = 11  # fewer are too few for most phases
@@ -115,7 +115,7 @@ def _explain_hand_over(phase: PhaseResult, hand_over: HandOver) -> PhaseResult:
     """Name the contacts of a hand-over that no torque survives."""
     old, new = (one.name for one in hand_over)
     detail = f"{old} hands over to {new} there, and no torque holds and moves the object under either"
-    return replace(phase, detail=detail, remedy=REMEDY_HAND_OVER)
+    return replace(phase, detail=detail, remedy=REMEDY_LOST_HAND_OVER)
 
 
 def _no_torque_holds(phase: PhaseResult, bound: float) -> bool:

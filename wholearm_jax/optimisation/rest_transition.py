@@ -23,11 +23,17 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.core import CachedJit, LinearProgramme
 from wholearm_jax.dynamics import PathDynamics
-from wholearm_jax.margin import MARGIN_TIE, RestAccelerations, Statics, affine_coefficients, cone_facets
+from wholearm_jax.margin import (
+    MARGIN_TIE,
+    MIN_REST_MARGIN,
+    RestAccelerations,
+    Statics,
+    affine_coefficients,
+    cone_facets,
+)
 
 MIN_ACCELERATION = 1.0  # least with which an object arrives, or starts without a dwell [path lengths a duration^2]
 MIN_SPEED_CHANGE = 2.0  # within which the largest acceleration is reached [path lengths a duration]
-MIN_REST_MARGIN = 0.01  # distance of torques at rest from those that would move the object, over the limits
 
 
 class Moving(NamedTuple):

@@ -5,11 +5,12 @@ the two contacts holds it there is decided by less than a micrometre: the plan i
 under either. So the torque with which it arrives, a little early or late, must press both contacts and brake it, the
 one that holds it must do so by either, and the one with which it starts must press both and move it on:
 
-    arrives:  c_n >= m,   a <= -`LEAST_ACCELERATION` L / T^2    at the end of the one path and at the start of the other
+    arrives:  c_n >= m,   a <= -d |da/dtau|     at the end of the one path and at the start of the other
     stays:    some forces within both sets of limits (`margin.statics`) with c_n >= m
-    starts:   c_n >= m,   a >= `LEAST_ACCELERATION` L / T^2
+    starts:   c_n >= m,   a >= d |da/dtau|
 
-All are linear in the torque and `m`: linear programmes.
+with torques over their limits and the surplus `d` that `LEAST_SURPLUS` says: an object that hardly moves stays. All are
+linear in the torque and `m`: linear programmes.
 """
 
 from typing import NamedTuple
@@ -23,6 +24,7 @@ from wholearm_jax.core import CachedJit, LinearProgramme, Status
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.margin import (
     MARGIN_TIE,
+    MIN_REST_MARGIN,
     RestAccelerations,
     StaticMargin,
     Statics,
@@ -34,9 +36,8 @@ from wholearm_jax.phases.phase_ends import ends_at_stop
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.tracing import PathEnd
 
-LEAST_ACCELERATION = 1.0  # with which the object starts under either contact [path lengths a duration^2]
-ROUNDING = 1e-6  # by which a torque's acceleration may fall short of the least
-MIN_REST_MARGIN = 0.01  # distance of torques at rest from those that would move the object, over the limits
+LEAST_SURPLUS = 0.03  # of the torques that brake or move the object, over the limits, beyond those that only balance
+SURPLUS_ROUNDING = 1e-6  # by which a surplus may fall short
 
 
 class OneContact(NamedTuple):
@@ -46,7 +47,11 @@ class OneContact(NamedTuple):
     statics: Statics
     accelerations: RestAccelerations
     slack: Float[np.ndarray, "facets 3"]  # of the forces of forward travel [N], linear in `(1, tau1, tau2)`
-    least: float  # acceleration with which it starts, in the unit of `accelerations`
+
+    def surplus_row(self, limit: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
+        """Return how far torques are beyond those that keep the object's speed, linear in `(1, tau / limit)`."""
+        row = self.accelerations.ahead * np.append(1.0, limit)
+        return row / np.linalg.norm(row[1:])
 
     def arrives(self, torque: Float[np.ndarray, "2"]) -> bool:
         """Say whether forces press while the object arrives, or passes by a little."""
@@ -104,16 +109,15 @@ class HandOver(NamedTuple):
         for prefix, one in zip(("before_", "after_"), self, strict=True):
             slack = one.slack / self.before.statics.unit
             programme.at_least(prefix + "forces", -slack[:, 0], torque=slack[:, 1:] * limit, level=-1.0)
-            ahead = sign * one.accelerations.ahead
-            by_torque = ahead[1:] * limit
-            size = np.linalg.norm(by_torque)
-            least = [(one.least - ahead[0]) / size]
-            programme.at_least(prefix + "acceleration", least, torque=by_torque[None] / size, apart=-1.0)
+            surplus = sign * one.surplus_row(limit)
+            least = [LEAST_SURPLUS - surplus[0]]
+            programme.at_least(prefix + "surplus", least, torque=surplus[None, 1:], apart=-1.0)
         return self._central(programme)
 
     def _motion_margin(self, torque: Float[np.ndarray, "2"], sign: float) -> float:
-        load = np.append(1.0, torque)
-        if any(sign * one.accelerations.ahead @ load < one.least * (1 - ROUNDING) for one in self):
+        load, limit = np.append(1.0, torque), self.before.statics.torque_limit
+        scaled = np.append(1.0, torque / limit)
+        if any(sign * one.surplus_row(limit) @ scaled < LEAST_SURPLUS - SURPLUS_ROUNDING for one in self):
             return -np.inf
         return float(min((one.slack @ load).min() for one in self))
 
@@ -184,7 +188,6 @@ def _one_contact(scene: Scene, name: str, phase: Phase, path: TracedPhase, end: 
         statics=contact_statics(scene, phase.formation, z),
         accelerations=RestAccelerations(forward, backward),
         slack=slack,
-        least=LEAST_ACCELERATION * float(dynamics.length) / float(phase.duration) ** 2,
     )
 
 

@@ -24,10 +24,11 @@ from wholearm_jax.model import (
 )
 from wholearm_jax.phases import configuration, trace_phase
 from wholearm_jax.planning.path_choices import path_choices
-from wholearm_jax.planning.successors import MIN_PATH_LENGTH, touching_contacts
+from wholearm_jax.planning.successors import touching_contacts
 from wholearm_jax.tracing import Resolution
 
 MOVES_PER_CALL = 8  # paths that one call of the program traces; the last call is filled up
+SHORTEST_MOVE = 0.02  # path length, in the object's radii, below which a hand cannot tell a move from standing still
 PLACES = 33  # configurations of a path that are kept
 RESOLUTION = Resolution(panels=16)  # of the planner's tables: forces to three digits
 
@@ -83,7 +84,7 @@ def moves_from(
     for part, paths in zip(parts, traced, strict=True):
         for k, (contacts, toward) in enumerate(part):
             row = jax.tree.map(lambda a, k=k: a[k], paths)
-            if row.status == Status.OK and row.length >= MIN_PATH_LENGTH:
+            if row.status == Status.OK and row.length >= SHORTEST_MOVE:
                 ends = int(row.end_reason), int(row.end_contact)
                 moves.append(Move(contacts, toward, float(row.length), row.places, row.margins, *ends))
     return tuple(moves)

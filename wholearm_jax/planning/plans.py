@@ -1,5 +1,6 @@
 """Plans: phases that lead to a goal, each with its certificate, and what a search for them returns."""
 
+import itertools
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -8,8 +9,8 @@ from jaxtyping import Float
 
 from wholearm_jax.core import CachedJit, Status, as_device_array
 from wholearm_jax.margin import margin_upper_bound
-from wholearm_jax.model import Phase, Scene, contact_formation, path_target
-from wholearm_jax.phases import describe_end, trace
+from wholearm_jax.model import AWAY_NAMES, EDGE, Phase, Scene, contact_formation, parse_contact, path_target
+from wholearm_jax.phases import describe_end, find_hand_overs, trace
 from wholearm_jax.planning.goal import Goal
 
 _phase_bound = CachedJit(margin_upper_bound)
@@ -75,7 +76,29 @@ class PlanningResult:
 def make_plan(
     scene: Scene, start: Float[np.ndarray, "5"], steps: tuple[Step, ...], duration: float, goal: Goal | None
 ) -> Plan | None:
-    """Trace steps as a plan at full resolution; None where a phase cannot be traced, or the goal is missed."""
+    """Trace steps as a plan at full resolution.
+
+    None where a phase cannot be traced, no torque survives a hand-over between two, or the goal is missed.
+    """
+    planned = _as_scene(scene, start, steps, duration)
+    traced = trace(planned)
+    if any(int(one.dynamics.status) != Status.OK or bool(one.dynamics.ends_at_obstacle) for one in traced):
+        return None
+    ends = tuple(np.asarray(one.end) for one in traced)
+    if goal is not None and not goal.is_reached(ends[-1]):
+        return None
+    phases = planned.phases
+    reasons = tuple(describe_end(planned, phase, one) for phase, one in zip(phases, traced, strict=True))
+    if any(over is not None and not over.margin > 0 for over in find_hand_overs(planned, traced)):
+        return None
+    values = tuple(
+        float(_phase_bound(one.dynamics, phase.duration).value) for phase, one in zip(phases, traced, strict=True)
+    )
+    return Plan(planned, steps, tuple(np.asarray(one.begin) for one in traced), ends, reasons, values)
+
+
+def _as_scene(scene: Scene, start: Float[np.ndarray, "5"], steps: tuple[Step, ...], duration: float) -> Scene:
+    """Write steps as the phases of a scene."""
     phases = tuple(
         Phase(
             f"{k + 1}: {step.toward}",
@@ -86,15 +109,27 @@ def make_plan(
         )
         for k, step in enumerate(steps)
     )
-    planned = eqx.tree_at(lambda s: (s.start, s.phases), scene, (as_device_array(start), phases))
-    traced = trace(planned)
-    if any(int(one.dynamics.status) != Status.OK or bool(one.dynamics.ends_at_obstacle) for one in traced):
-        return None
-    ends = tuple(np.asarray(one.end) for one in traced)
-    if goal is not None and not goal.is_reached(ends[-1]):
-        return None
-    reasons = tuple(describe_end(planned, phase, one) for phase, one in zip(phases, traced, strict=True))
-    values = tuple(
-        float(_phase_bound(one.dynamics, phase.duration).value) for phase, one in zip(phases, traced, strict=True)
+    return eqx.tree_at(lambda s: (s.start, s.phases), scene, (as_device_array(start), phases))
+
+
+def may_hand_over(before: tuple[str, ...], after: tuple[str, ...], vertices: int) -> bool:
+    """Say whether one contact of a finger may take over from another at a vertex, at least one of them by its tip."""
+    gone, new = set(before) - set(after), set(after) - set(before)
+    pairs = itertools.product(map(parse_contact, gone - {*AWAY_NAMES}), map(parse_contact, new - {*AWAY_NAMES}))
+    return any(
+        one[0] == other[0] and EDGE in (one[1], other[1]) and _vertices(one, vertices) & _vertices(other, vertices)
+        for one, other in pairs
     )
-    return Plan(planned, steps, tuple(np.asarray(one.begin) for one in traced), ends, reasons, values)
+
+
+def _vertices(contact: tuple[int, int, int, bool], count: int) -> set[int]:
+    """Return the vertices at a contact's feature."""
+    _, kind, feature, _ = contact
+    return {feature, (feature + 1) % count} if kind == EDGE else {feature}
+
+
+def survives_hand_over(scene: Scene, begin: Float[np.ndarray, "5"], steps: tuple[Step, Step], duration: float) -> bool:
+    """Say whether torques hold and move the object under either contact between two steps, the first from `begin`."""
+    planned = _as_scene(scene, begin, steps, duration)
+    over = find_hand_overs(planned, trace(planned))[1]
+    return over is None or over.margin > 0

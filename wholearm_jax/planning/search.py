@@ -24,7 +24,15 @@ from wholearm_jax.phases import trace
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import Move, moves_from
 from wholearm_jax.planning.obstructions import explain_failure
-from wholearm_jax.planning.plans import Edge, Plan, PlanningResult, Step, make_plan
+from wholearm_jax.planning.plans import (
+    Edge,
+    Plan,
+    PlanningResult,
+    Step,
+    make_plan,
+    may_hand_over,
+    survives_hand_over,
+)
 from wholearm_jax.planning.regrasps import regrasp_stops, separate_regrasps
 from wholearm_jax.planning.successors import touching_contacts
 
@@ -228,14 +236,30 @@ def _expand(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching) -
     # On or back along the same path is no new move.
     stops = [(move, stop) for move in others if move.contacts != previous for stop in _stops(search, move)]
     last = steps[-1].regrasp if steps else None
+    survives = _hand_over_check(search, steps)
     capacity = search.scene.object.vertices.shape[0]
     stops += [(move, stop) for move in alone for stop in regrasp_stops(move, capacity, last, search.goal.values)]
     for move, (step, is_end) in stops:
-        if step.margin > search.floor:
+        if step.margin > search.floor and survives(move, step):
             search.graph.append(Edge(z, step.end, step.margin))
             # Along the path of a finger alone, more may touch than what holds the object.
             seen = None if is_end or step.regrasp else _names(move)
             _push(search, step.end, (*steps, step), seen)
+
+
+def _hand_over_check(search: _Search, steps: tuple[Step, ...]) -> Callable[[Move, Step], bool]:
+    """Return what says whether torques survive the hand-over, if any, from the last step to a move."""
+    count, known, last = int(rigid_body(search.scene.object).count), {}, steps[-1] if steps else None
+
+    def survives(move: Move, step: Step) -> bool:
+        if last is None or last.until is not None or not may_hand_over(last.contacts, move.contacts, count):
+            return True
+        if move.contacts not in known:
+            begin = steps[-2].end if len(steps) > 1 else search.start
+            known[move.contacts] = survives_hand_over(search.scene, begin, (last, step), search.duration)
+        return known[move.contacts]
+
+    return survives
 
 
 def _names(move: Move) -> tuple[str, ...]:
