@@ -4,9 +4,10 @@
 
 Parts, hands and goals are those of `planning.py`, turns by 45 to 90 degrees with regrasps; each part on each hand is
 asked one goal after the other. The best plan that is found is optimised, each phase in a second, and executed at the
-default time step. An execution succeeds within 0.5 mm and 0.01 rad of the predicted end, the last contacts closed and
-no link met that should not be. Prints and writes how many plans are optimised, how many executions succeed, and what
-became of the others.
+default time step: open loop, and where that does not succeed, as where errors grow along a path, under the law of
+`wholearm optimise --feedback` at 1 kHz, 1 ms late, with encoders of 4096 counts and 1 % of torque noise. An execution
+succeeds within 0.5 mm and 0.01 rad of the predicted end, the last contacts closed and no link met that should not be.
+Prints and writes how many plans are optimised, how many executions succeed, and what became of the others.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from planning import GOALS, HANDS, at_rest, objects
 import wholearm_jax as wa
 from wholearm_jax.core import Status
 from wholearm_jax.ensembles import wilson_interval
-from wholearm_jax.execution import ExecutionOutcome, execute
+from wholearm_jax.execution import ExecutionOutcome, Hardware, execute
 
 TURNS = {f"turn {a} deg": {"phi": -np.radians(a)} for a in (45, 60, 75, 90)}
 REGRASP_COST = 1.0
@@ -57,6 +58,12 @@ def carry_out(scene: wa.Scene) -> dict:
     if optimum.result.status != Status.OK:
         return found
     execution = execute(optimum.result)
+    found["open_loop"] = execution.ending.value
+    if execution.ending is not ExecutionOutcome.OK:
+        try:
+            execution = execute(optimum.result, controller=wa.feedback(scene, optimum.torque), hardware=Hardware())
+        except ValueError as refused:  # no law holds the object
+            found["message"] = str(refused)
     return found | {
         "ending": execution.ending.value,
         "execution": execution.message,
@@ -74,7 +81,8 @@ def measure(count: int, seconds: float, seed: int, regrasp_cost: float | None) -
         rows.append(about | carry_out(scene))
         row = rows[-1]
         print(
-            f"{row['kind']}, {row['hand']}, {row['goal']}: {row.get('execution', row['message'])}",
+            f"{row['kind']}, {row['hand']}, {row['goal']}: open loop {row.get('open_loop', 'none')};"
+            f" {row.get('execution', row['message'])}",
             flush=True,
         )
     return rows
@@ -85,10 +93,12 @@ def report(label: str, rows: list[dict]) -> None:
     endings = Counter(row.get("ending", "not executed: " + row["status"]) for row in rows)
     succeed = endings.pop(ExecutionOutcome.OK.value, 0)
     low, high = wilson_interval(succeed, len(rows))
+    alone = sum(row.get("open_loop") == ExecutionOutcome.OK.value for row in rows)
     others = ", ".join(f"{count} {why}" for why, count in endings.most_common()) or "no other"
     errors = [row["position_error"] for row in rows if "position_error" in row]
     print(
-        f"{label}: {succeed} of {len(rows)} executions succeed ({100 * low:.0f} to {100 * high:.0f} %); {others};"
+        f"{label}: {succeed} of {len(rows)} executions succeed ({100 * low:.0f} to {100 * high:.0f} %),"
+        f" {alone} of them open loop; {others};"
         f" {1e3 * np.median(errors):.3g} mm from the predicted end in the median"
     )
 

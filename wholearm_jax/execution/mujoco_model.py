@@ -14,10 +14,6 @@ make MuJoCo's distances equal the C-functions:
   object. Wedges do not overlap, so that a concave object needs no decomposition. (MuJoCo keeps their corners in single
   precision: a few nanometres.)
 
-A vertex under load is a little inside the finger, and so is the tip inside the object when the vertex passes it, where
-no edge's wedge would catch it. So a finger's face goes on beyond its tip (`_tip_extension`), by ten times of what
-contacts sag under a load of five weights: 18 micrometres at a step of 0.2 ms, 1 at 0.05 ms.
-
 The links are bodies among themselves, too: fingertips and joints are dots against the other finger, and fingertips
 against the palm, without friction; ranges are joint limits. Layered fingers do not meet.
 
@@ -72,8 +68,6 @@ POINT_RADIUS = 1e-5  # radius of a dot [object radii]: far above rounding, its l
 PAIR_DISTANCE = (
     1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
 )
-TIP_LOAD, TIP_SAGS = 50.0, 10.0  # a finger's face goes on beyond its tip by so many sags under so much [m/s^2],
-MAX_TIP = 1e-3  # at most by this [object radii]
 HALF_SPACE_DEPTH = 0.2  # slabs, and all shapes in depth [object radii]
 
 
@@ -136,7 +130,7 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
     size = float(np.sqrt((solid.vertices[: solid.count] ** 2).sum(1).max()))
     spec = _world(scene, timestep, softness)
     _add_object(spec, solid, size)
-    _add_hand(spec, scene.hand, size, _gives_way(softness, timestep), _tip_extension(softness, timestep, size))
+    _add_hand(spec, scene.hand, size, _gives_way(softness, timestep))
     rows = _add_pairs(spec, solid, size, timestep, softness)
     meetings = _add_link_pairs(spec, hand, size, timestep, softness)
     model = spec.compile()
@@ -211,13 +205,7 @@ def _add_object(spec, solid, size):
         _add_geom(body_, f"e{k}", "MESH", [0, 0, 0], [0, 0, 0], meshname=f"e{k}")
 
 
-def _tip_extension(softness: ContactCompliance, timestep: float, size: float) -> float:
-    """Return how far a finger's face goes on beyond its tip [m]."""
-    sag = (1 - softness.impedance) * TIP_LOAD * (softness.time_constant * timestep) ** 2
-    return min(TIP_SAGS * sag, MAX_TIP * size)
-
-
-def _add_hand(spec, hand, size, compliance, beyond):
+def _add_hand(spec, hand, size, compliance):
     """The palm, and two fingers with a motor each; the tip is a dot at the end of the contact edge.
 
     What only links meet: a dot on the joint, one at the end of a back apart from the contact edge, and the back's slab.
@@ -242,7 +230,7 @@ def _add_hand(spec, hand, size, compliance, beyond):
             solref_limit=compliance["solref"],
             solimp_limit=compliance["solimp"],
         )
-        _add_slab(finger, name, 0.0, length + beyond, side * offset - side * dot, -side, thick)
+        _add_slab(finger, name, 0.0, length, side * offset - side * dot, -side, thick)
         _add_geom(finger, f"{name}_tip", "SPHERE", [dot, 0, 0], [length, side * offset, 0])
         back = float(hand.back[k])
         _add_slab(finger, f"{name}_back", 0.0, length, -side * (back - dot), side, thick)

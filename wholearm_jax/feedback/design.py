@@ -25,12 +25,12 @@ from wholearm_jax.phases import (
     TracedPhase,
     ends_at_stop,
     group_phases,
+    hand_over_contacts,
     require_motion,
     simulate,
     trace,
     trajectory,
 )
-from wholearm_jax.tracing import PathEnd
 
 RESERVE = 0.9  # fraction of the torque limits that the reference's torques and their corrections stay within
 PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
@@ -162,12 +162,8 @@ def _motions(scene: Scene, group, tables, approaches, courses, own_motion: bool)
 
 def _hand_overs(scene: Scene, traced: tuple[TracedPhase, ...]) -> list[bool]:
     """Say of each two phases whether a vertex and a fingertip take over from one another between them, at rest."""
-    return [
-        phase.arrive is not Arrival.MOVING
-        and int(path.path.end_reason) == PathEnd.CONTACT_MADE
-        and not ends_at_stop(scene, phase, path)
-        for phase, path in zip(scene.phases[:-1], traced[:-1], strict=True)
-    ]
+    pairs = zip(scene.phases[:-1], traced[:-1], scene.phases[1:], strict=True)
+    return [hand_over_contacts(scene, *pair) is not None for pair in pairs]
 
 
 def _with_either_formation(

@@ -16,7 +16,6 @@ import equinox as eqx
 import jax
 import numpy as np
 import optax
-from jaxtyping import Float
 
 from wholearm_jax.core import Status, as_device_array, stack_trees
 from wholearm_jax.margin import MarginBound
@@ -43,7 +42,6 @@ from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
 GUESS_TORQUE_FRACTION = 0.9  # of the torque limits, that an initial guess may use
 MIN_DURATION_FRACTION = 0.01  # of its longest duration, that a phase takes at least
-LEAST_HAND_OVER = 0.5  # of the best margin, with which the object arrives at or starts from a hand-over
 GOOD_BOUND_FRACTION = 0.99  # of the bound, with which no further guess is tried
 
 
@@ -54,36 +52,6 @@ class GroupSolution(NamedTuple):
     reason: str  # why iterations ended
     history: list[IterationRecord]
     score: tuple[bool, float] = (False, -np.inf)  # whether the simulation is `ok`, and its least margin over its bound
-
-
-class EndTorques(NamedTuple):
-    """Torques [N m] with which phases have to begin and to end; None: any."""
-
-    first: Float[np.ndarray, "2"] | None = None
-    last: Float[np.ndarray, "2"] | None = None
-
-
-class HandOvers(NamedTuple):
-    """The hand-overs with which phases begin and end, if they do and torques survive them."""
-
-    first: HandOver | None
-    last: HandOver | None
-
-    def torques_to_try(self) -> list[EndTorques]:
-        """Return the ends to try in turn: any, and the best ones for the hand-overs."""
-        first = None if self.first is None else self.first.best_start()
-        last = None if self.last is None else self.last.best_arrival()
-        chosen = EndTorques(*(None if best is None else best.torque for best in (first, last)))
-        return [EndTorques()] if first is last is None else [EndTorques(), chosen]
-
-    def fraction(self, first: Float[np.ndarray, "2"], last: Float[np.ndarray, "2"]) -> float:
-        """Return the least margin with which the object starts and arrives, over the largest possible."""
-        fractions = [1.0]
-        if self.first is not None:
-            fractions.append(self.first.start_margin(first) / self.first.best_start().margin)
-        if self.last is not None:
-            fractions.append(self.last.arrival_margin(last) / self.last.best_arrival().margin)
-        return min(fractions)
 
 
 @dataclass(frozen=True)
@@ -111,9 +79,8 @@ class CoupledPhases:
     margin_bounds: list[MarginBound]
     begin: RestTransition | None  # to the first phase, where torque rates are limited and another stands before
     end: RestTransition | None  # from the last phase
+    hand_over: HandOver | None  # with which the first one begins
     convex: ConvexStart | None  # of a single phase
-    hand_overs: HandOvers
-    end_torques: EndTorques  # with which the phases have to begin and to end
     tries_profile: bool  # whether a smooth motion is tried as well
     first_guess: int  # number of the first initial guess
     options: OptimiseOptions
@@ -124,10 +91,6 @@ class CoupledPhases:
         fixed = {}
         if self.begin is not None and self.begin.is_feasible:
             fixed[0, 0] = self.begin.departure_torque / self.torque_limits[0]
-        if self.end_torques.first is not None:
-            fixed[0, 0] = self.end_torques.first / self.torque_limits[0]
-        if self.end_torques.last is not None:
-            fixed[-1, -1] = self.end_torques.last / self.torque_limits[-1]
         if self.end is not None and self.end.is_feasible:
             fixed[-1, -1] = self.end.torque / self.torque_limits[-1]
         return fixed
@@ -247,14 +210,8 @@ def _schedules(group: CoupledPhases, p: Variables) -> list[TorqueSchedule]:
 
 
 def _verify_by_simulation(scene: Scene, group: CoupledPhases, p: Variables) -> tuple[bool, float]:
-    """Simulate the schedules: whether all phases are `ok`, rests and hand-overs included, and the least margin.
-
-    That is over its bound.
-    """
-    torque_limits, hand_over = group.torque_limits, group.hand_overs.first
-    first, last = (np.asarray(p.torque[k, k]) * torque_limits[k] for k in (0, -1))
-    start, fractions, incoming_velocity = 0.0, [], None
-    is_ok = [group.hand_overs.fraction(first, last) >= LEAST_HAND_OVER]
+    """Simulate the schedules: whether all phases are `ok`, rests included, and the least margin over its bound."""
+    start, fractions, is_ok, incoming_velocity, hand_over = 0.0, [], [], None, group.hand_over
     torque = concatenate_schedules(_schedules(group, p))
     schedule = pad_schedule(torque, group.options.schedule_rows)
     options = with_step_capacity(IntegratorOptions(), group.options.knots)
@@ -267,7 +224,7 @@ def _verify_by_simulation(scene: Scene, group: CoupledPhases, p: Variables) -> t
         start += float(simulated.duration) * float(np.asarray(motion.phase_time)[int(motion.count)])
         incoming_velocity = simulated.exit_velocity if phase.arrive is Arrival.MOVING else None
         rests = rest_intervals(scene, torque, phase, path, simulated, hand_over)
-        hand_over = None  # of the first phase alone
+        hand_over = None
         stays = all(rest.loss_time is None for rest in rests)
         is_ok.append(int(simulated.assessment.status) == Status.OK and stays)
         fractions.append(float(simulated.margin_result.margin) / bound)

@@ -62,7 +62,6 @@ from wholearm_jax.optimisation.coupled_phases import (
     MIN_DURATION_FRACTION,
     CoupledPhases,
     GroupSolution,
-    HandOvers,
     OptimiseOptions,
     solve_coupled_phases,
 )
@@ -266,18 +265,16 @@ def _solve_group(
         schedules = [uniform_schedule(float(phase.duration), np.zeros((options.knots, 2))) for phase in phases]
         return GroupSolution(schedules, f"phase '{scene.phases[short[0]].name}' is too short for any motion", [])
     margin_bounds: list[MarginBound] = [limits.bounds[k] for k in group]
-    around = (limits.hand_overs[group[0]], next(iter(limits.hand_overs[group[-1] + 1 :]), None))
-    hand_overs = HandOvers(*(None if over is None or not over.margin > 0 else over for over in around))
+    hand_over = limits.hand_overs[group[0]]
     starts: list[ConvexStart] = []
     if len(group) == 1 and int(paths[0].dynamics.status) == Status.OK and float(margin_bounds[0].value) > 0:
         may_wait = options.rate_limit is None and options.durations is None
         moving = float(phases[0].duration) - (ends[0].dwell_time if ends[0] is not None else 0.0)
-        starts = convex_starts(scene, phases[0], paths[0], moving, options.knots, may_wait, hand_overs.first)
+        starts = convex_starts(scene, phases[0], paths[0], moving, options.knots, may_wait, hand_over)
     solutions: list[GroupSolution] = []
-    for convex, torques in itertools.product(starts or [None], hand_overs.torques_to_try()):
+    for convex in starts or [None]:
         only, tried = len(starts) <= 1, len(solutions)
-        more = (hand_overs, torques, only, tried, options)
-        coupled = CoupledPhases(group[0], phases, paths, margin_bounds, *ends, convex, *more)
+        coupled = CoupledPhases(group[0], phases, paths, margin_bounds, *ends, hand_over, convex, only, tried, options)
         solutions.append(solve_coupled_phases(scene, coupled))
         if solutions[-1].score >= (True, 1 - options.tolerance):
             break

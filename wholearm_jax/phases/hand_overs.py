@@ -1,9 +1,9 @@
 r"""Hand-overs: where a vertex on a finger reaches its tip, the tip goes on along an edge, or the other way round.
 
 The object rests where one phase ends and the next begins, at a place at which the vertex and the tip coincide. Which of
-the two contacts holds it there is decided by less than a micrometre: the plan is carried out only where the torques do
-under either. So the torque with which it arrives, a little early or late, must press both contacts and brake it, the
-one that holds it must do so by either, and the one with which it starts must press both and move it on:
+the two contacts holds it there is decided by less than a micrometre. So the torque that holds it must do so by either
+contact; and there must be torques that press both contacts while they brake the object, however it arrives, and while
+they move it on:
 
     arrives:  c_n >= m,   a <= -d |da/dtau|     at the end of the one path and at the start of the other
     stays:    some forces within both sets of limits (`margin.statics`) with c_n >= m
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core import CachedJit, LinearProgramme, Status
+from wholearm_jax.core import CachedJit, LinearProgramme, LinearProgrammeSolution, Status
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.margin import (
     MARGIN_TIE,
@@ -37,7 +37,6 @@ from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.tracing import PathEnd
 
 LEAST_SURPLUS = 0.03  # of the torques that brake or move the object, over the limits, beyond those that only balance
-SURPLUS_ROUNDING = 1e-6  # by which a surplus may fall short
 
 
 class OneContact(NamedTuple):
@@ -53,19 +52,6 @@ class OneContact(NamedTuple):
         row = self.accelerations.ahead * np.append(1.0, limit)
         return row / np.linalg.norm(row[1:])
 
-    def arrives(self, torque: Float[np.ndarray, "2"]) -> bool:
-        """Say whether forces press while the object arrives, or passes by a little."""
-        return bool((self.slack @ np.append(1.0, torque)).min() >= 0)
-
-    def starts(self, torque: Float[np.ndarray, "2"]) -> bool:
-        """Say whether the object stays, or starts forward with forces that press."""
-        load = np.append(1.0, torque)
-        if self.accelerations.behind @ load < 0:
-            return False
-        if self.accelerations.ahead @ load > 0:
-            return self.arrives(torque)
-        return self.statics.margin_under(torque).margin >= 0
-
 
 class HandOver(NamedTuple):
     """A contact that takes over from another at the same point, at rest."""
@@ -76,70 +62,50 @@ class HandOver(NamedTuple):
     @property
     def margin(self) -> float:
         """The least of the largest margins with which the object arrives, stays and starts [N]; negative: it cannot."""
-        return min(best.margin for best in (self.best_arrival(), self.best_hold(), self.best_start()))
+        return min(best.margin for best in (self.best_motion(-1.0), self.best_hold(), self.best_motion(1.0)))
 
     def best_hold(self) -> StaticMargin:
-        """Compute the torque that holds the object by either contact with the largest margin."""
+        """Compute the torque that holds the object by either contact with the largest margin.
+
+        Of torques with nearly this margin it is that which is farthest from those that move the object.
+        """
         programme, limit = self._programme()
         for prefix, one in zip(("before_", "after_"), self, strict=True):
             press = self.before.statics.unit / one.statics.unit
             one.statics.add_forces(programme, level="level", press=press, torque_unit=limit, prefix=prefix)
             rows = one.accelerations.rest_rows(limit)
             programme.at_most(prefix + "rest", -rows[:, 0] - MIN_REST_MARGIN, torque=rows[:, 1:], apart=1.0)
-        return self._central(programme)
-
-    def best_start(self) -> StaticMargin:
-        """Compute the torque with which the object starts under either contact with the largest margin."""
-        return self._best_motion(1.0)
-
-    def best_arrival(self) -> StaticMargin:
-        """Compute the torque with which the object arrives under either contact with the largest margin."""
-        return self._best_motion(-1.0)
-
-    def start_margin(self, torque: Float[np.ndarray, "2"]) -> float:
-        """Compute the least force [N] under either contact where the object starts; -inf where it does not."""
-        return self._motion_margin(torque, 1.0)
-
-    def arrival_margin(self, torque: Float[np.ndarray, "2"]) -> float:
-        """Compute the least force [N] under either contact where the object arrives; -inf where it is not braked."""
-        return self._motion_margin(torque, -1.0)
-
-    def _best_motion(self, sign: float) -> StaticMargin:
-        programme, limit = self._programme()
-        for prefix, one in zip(("before_", "after_"), self, strict=True):
-            slack = one.slack / self.before.statics.unit
-            programme.at_least(prefix + "forces", -slack[:, 0], torque=slack[:, 1:] * limit, level=-1.0)
-            surplus = sign * one.surplus_row(limit)
-            least = [LEAST_SURPLUS - surplus[0]]
-            programme.at_least(prefix + "surplus", least, torque=surplus[None, 1:], apart=-1.0)
-        return self._central(programme)
-
-    def _motion_margin(self, torque: Float[np.ndarray, "2"], sign: float) -> float:
-        load, limit = np.append(1.0, torque), self.before.statics.torque_limit
-        scaled = np.append(1.0, torque / limit)
-        if any(sign * one.surplus_row(limit) @ scaled < LEAST_SURPLUS - SURPLUS_ROUNDING for one in self):
-            return -np.inf
-        return float(min((one.slack @ load).min() for one in self))
-
-    def _programme(self) -> tuple[LinearProgramme, Float[np.ndarray, "2"]]:
-        """Begin a programme: torques over their limits, the margin over the unit of force, and distance from limits."""
-        programme = LinearProgramme()
-        programme.add_variables("torque", -np.ones(2), np.ones(2))
-        programme.add_variables("level", -np.inf, np.inf)
-        programme.add_variables("apart", 0.0, 0.0)
-        return programme, self.before.statics.torque_limit
-
-    def _central(self, programme: LinearProgramme) -> StaticMargin:
-        """Maximise the margin, then go as far as nearly this margin allows from torques that do otherwise."""
-        statics = self.before.statics
         best = programme.maximise("level")
         if best is None:
             return StaticMargin(-np.inf, self.after.name, np.zeros(2))
         level = float(best.values["level"][0])
         programme.set_bounds("level", level - (1 - MARGIN_TIE) * abs(level), np.inf)
         programme.set_bounds("apart", 0.0, 1.0)
-        central = programme.maximise("apart") or best
-        return StaticMargin(level * statics.unit, self.after.name, statics.torque_limit * central.values["torque"])
+        return self._margin(level, programme.maximise("apart") or best)
+
+    def best_motion(self, sign: float) -> StaticMargin:
+        """Compute the torque that starts (1) or stops (-1) the object with the largest margin by either contact."""
+        programme, limit = self._programme()
+        for prefix, one in zip(("before_", "after_"), self, strict=True):
+            slack, surplus = one.slack / self.before.statics.unit, sign * one.surplus_row(limit)
+            programme.at_least(prefix + "forces", -slack[:, 0], torque=slack[:, 1:] * limit, level=-1.0)
+            programme.at_least(prefix + "surplus", [LEAST_SURPLUS - surplus[0]], torque=surplus[None, 1:])
+        best = programme.maximise("level")
+        if best is None:
+            return StaticMargin(-np.inf, self.after.name, np.zeros(2))
+        return self._margin(float(best.values["level"][0]), best)
+
+    def _programme(self) -> tuple[LinearProgramme, Float[np.ndarray, "2"]]:
+        """Begin a programme: torques over their limits, the margin over the unit of force, distance from limits."""
+        programme = LinearProgramme()
+        programme.add_variables("torque", -np.ones(2), np.ones(2))
+        programme.add_variables("level", -np.inf, np.inf)
+        programme.add_variables("apart", 0.0, 0.0)
+        return programme, self.before.statics.torque_limit
+
+    def _margin(self, level: float, solution: LinearProgrammeSolution) -> StaticMargin:
+        statics = self.before.statics
+        return StaticMargin(level * statics.unit, self.after.name, statics.torque_limit * solution.values["torque"])
 
 
 def find_hand_overs(scene: Scene, traced: tuple[TracedPhase, ...]) -> list[HandOver | None]:

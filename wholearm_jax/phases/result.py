@@ -9,9 +9,9 @@ import jax
 import numpy as np
 
 from wholearm_jax.core import Status
-from wholearm_jax.margin import RestInterval, contact_statics, rest_margin, schedule_corners
+from wholearm_jax.margin import RestInterval, contact_statics, rest_margin
 from wholearm_jax.model import COORDINATES, Arrival, Phase, Scene, TorqueSchedule
-from wholearm_jax.phases.hand_overs import HandOver, OneContact, find_hand_overs
+from wholearm_jax.phases.hand_overs import HandOver, find_hand_overs
 from wholearm_jax.phases.obstacles import describe_refused_start
 from wholearm_jax.phases.phase_ends import configuration, describe_end
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
@@ -22,7 +22,6 @@ from wholearm_jax.tracing import PathEnd
 SLIP_TOL = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
 REFUSED_STARTS = (Status.LEFT_FORMATION, Status.OBSTACLE)  # statuses of a path that mean that it cannot begin
 REMEDY_START = "the path cannot begin there: correct the start's pose and angles, or choose other contacts or fingers"
-REMEDY_HAND_OVER = "take torques that do under either, or optimise"
 UNTIL_FRACTION = 0.05  # of a path that ends at an obstacle, which the advice leaves out
 MIN_REST = 1e-9  # share of a phase: an object that comes to rest at its end does so earlier or later by rounding
 
@@ -115,7 +114,7 @@ def build_result(scene: Scene, torque: TorqueSchedule, traced, found) -> Result:
     """Arrays as a readable result."""
     rows = []
     hand_overs = find_hand_overs(scene, traced)
-    for phase, at, outcome, *ends in zip(scene.phases, traced, found, hand_overs, [*hand_overs[1:], None], strict=True):
+    for phase, at, outcome, hand_over in zip(scene.phases, traced, found, hand_overs, strict=True):
         names, start, length = phase.formation.names, float(outcome.start), float(outcome.duration)
         assessment, scored = outcome.assessment, outcome.margin_result
         slot, of_slot = int(assessment.contact), phase.formation.contact_of_row
@@ -135,14 +134,13 @@ def build_result(scene: Scene, torque: TorqueSchedule, traced, found) -> Result:
             margin_s=float(scored.s),
             margin_contact=names[of_slot[int(scored.contact)]],
             impulses=tuple(float(np.asarray(outcome.impact.impulse)[k]) for k in phase.formation.normal_rows),
-            holds=_holds(scene, torque, phase, at, outcome, ends[0]),
+            holds=_holds(scene, torque, phase, at, outcome, hand_over),
             traced=at,
             outcome=outcome,
             detail=_detail(scene, phase, at, Status(int(assessment.status))),
             remedy=path_remedy(phase, at),
         )
-        one = _with_hand_overs(torque, _with_holds(one), *ends)
-        rows.append(_with_standing_fingers(scene, torque, phase, one))
+        rows.append(_with_standing_fingers(scene, torque, phase, _with_holds(one)))
     return Result(scene, torque, tuple(rows))
 
 
@@ -214,32 +212,6 @@ def _holds(
     if phase.regrasp is None or int(traced.dynamics.status) != Status.OK:
         return rest_intervals(scene, torque, phase, traced, outcome, hand_over)
     return (hold_during_regrasp(scene, torque, phase, traced, float(outcome.start), float(outcome.duration)),)
-
-
-def _with_hand_overs(
-    torque: TorqueSchedule, one: PhaseResult, first: HandOver | None, last: HandOver | None
-) -> PhaseResult:
-    """Judge a phase that begins or ends with a hand-over by the other contact, too."""
-    motion, end = jax.device_get(one.outcome.motion), one.start + one.duration
-    if first is not None:
-        waits = bool(motion.at_rest[0]) and int(motion.count) > 0
-        share = float(motion.phase_time[1]) if waits else 0.0
-        time = one.start + one.duration * share
-        lasts = share < 1.0 and (one.status is Status.OK or one.time > time)
-        if lasts and not first.before.starts(schedule_corners(torque, time, end)[1][0]):
-            one = _lost_in_hand_over(one, first, first.before, time)
-    if last is not None and one.status is Status.OK:
-        time = one.start + one.duration * float(motion.phase_time[int(motion.count)])
-        if not last.after.arrives(schedule_corners(torque, one.start, time)[1][-1]):
-            one = _lost_in_hand_over(one, last, last.after, time)
-    return one
-
-
-def _lost_in_hand_over(one: PhaseResult, hand_over: HandOver, fails: OneContact, time: float) -> PhaseResult:
-    old, new = (contact.name for contact in hand_over)
-    detail = f"{old} hands over to {new} there, and under {fails.name} the torque loses a contact or the way"
-    more = {"contact": fails.name, "slips": False, "detail": detail, "remedy": REMEDY_HAND_OVER}
-    return replace(one, status=Status.CONTACT_LOST, time=time, **more)
 
 
 def _with_standing_fingers(scene: Scene, torque: TorqueSchedule, phase: Phase, one: PhaseResult) -> PhaseResult:

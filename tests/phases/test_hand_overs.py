@@ -1,0 +1,145 @@
+"""Hand-overs: where a vertex reaches a fingertip at rest, torques must do under either of the two contacts."""
+
+import copy
+
+import numpy as np
+import pytest
+from reference.unreduced import Model
+
+import wholearm_jax as wa
+from wholearm_jax.core import Status
+from wholearm_jax.phases import find_hand_overs
+from wholearm_jax.planning.plans import may_hand_over
+
+FINGER = {"length": 0.11, "inertia": 2e-3, "viscous": 0.02, "dry": 0.01, "torque_limit": 1.0}
+HAND = {f"finger{k}": FINGER | {"joint": [x, 0.0]} for k, x in ((1, 0.08), (2, -0.08))}
+BOX = [[0.0, 0.0], [0.0518, 0.0], [0.0518, 0.0498], [0.0, 0.0498]]
+VERTICES = ["palm:v0", "palm:v1", "finger1:v2", "finger2:v3"]
+
+
+def box_scene(*phases):
+    """A box that slides to the right until finger 2's tip reaches its vertex 3, and goes on from there."""
+    first = {"name": "1", "contacts": VERTICES, "toward": "x+", "duration": 1.0}
+    start = {"x": 0.01, "y": 0.0249, "phi": 0.0, "theta1": 2.295, "theta2": 0.661}
+    return {
+        "title": "box",
+        "gravity": 9.81,
+        "hand": HAND,
+        "object": {"vertices": BOX, "mass": 0.2, "friction": 0.1},
+        "start": start,
+        "phase": [first, *phases],
+    }
+
+
+SLIDE = {
+    "name": "2",
+    "contacts": ["palm:v0", "palm:v1", "finger1:v2", "finger2:e3"],
+    "toward": "x+",
+    "until": {"x": 0.051},
+    "duration": 1.0,
+}
+ROLL = {
+    "name": "2",
+    "contacts": ["finger2:e3 rolling", "palm:v1", "finger1:v2"],
+    "toward": "x-",
+    "until": {"x": 0.03},
+    "duration": 1.0,
+}
+
+
+def hand_over_of(data):
+    scene = wa.parse(copy.deepcopy(data))
+    traced = wa.trace(scene)
+    return scene, traced, find_hand_overs(scene, traced)[1]
+
+
+@pytest.fixture(scope="module")
+def sliding():
+    return hand_over_of(box_scene(SLIDE))
+
+
+def test_a_vertex_that_reaches_a_tip_hands_over_to_it(sliding):
+    scene, traced, over = sliding
+    assert (over.before.name, over.after.name) == ("finger2:v3", "finger2:e3")
+    assert find_hand_overs(scene, traced)[0] is None
+    np.testing.assert_allclose(traced[0].end, traced[1].begin, atol=1e-12)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["start", "arrival"])
+def test_forces_of_both_contacts_are_those_of_the_unreduced_equations(sliding, sign):
+    """The least force by either contact, and that it moves or brakes the object, from Newton's and Euler's laws."""
+    _, traced, over = sliding
+    best, z, least = over.best_motion(sign), np.array(traced[0].end), []
+    for contacts in (VERTICES, SLIDE["contacts"]):
+        model = Model(box_scene(), contacts)
+        tangent = model.direction(z, "x+")
+        acceleration, forces = model.solve(z, np.zeros(5), best.torque, np.sign(model.reversing(z, tangent)))
+        assert sign * acceleration @ tangent > 0
+        least.append(forces.min())
+    np.testing.assert_allclose(best.margin, min(least), rtol=1e-6)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["start", "arrival"])
+def test_no_torque_of_a_grid_does_better(sliding, sign):
+    _, traced, over = sliding
+    best, z = over.best_motion(sign), np.array(traced[0].end)
+    models = [Model(box_scene(), contacts) for contacts in (VERTICES, SLIDE["contacts"])]
+    tangents = [model.direction(z, "x+") for model in models]
+    grid, margins = np.linspace(-1.0, 1.0, 41), []
+    for torque in np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2):
+        pairs = list(zip(models, tangents, strict=True))
+        found = [m.solve(z, np.zeros(5), torque, np.sign(m.reversing(z, t))) for m, t in pairs]
+        if all(sign * a @ t > 0 for (a, _), t in zip(found, tangents, strict=True)):
+            margins.append(min(forces.min() for _, forces in found))
+    assert best.margin - 0.5 < max(margins) < best.margin + 0.5  # as coarse as the grid is; it asks for no surplus
+
+
+def test_a_torque_that_holds_by_one_contact_alone_holds_no_object(sliding):
+    """While the object waits at the hand-over, the margin is that of the contact that holds it less well."""
+    scene, traced, over = sliding
+    before, after = over
+    alone = after.statics.most_central_torque(after.accelerations)
+    assert alone.margin > 0
+    assert before.statics.margin_under(alone.torque).margin < 0
+    both = over.best_hold()
+    assert both.margin > 0
+    for one in over:
+        assert one.statics.margin_under(both.torque).margin >= 0.98 * both.margin
+    for hold, status in ((alone.torque, Status.CONTACT_LOST), (both.torque, None)):
+        torque = wa.torque_schedule([0.0, 1.0, 1.0, 2.0], [both.torque, both.torque, hold, hold])
+        second = wa.simulate(scene, torque, traced=traced).phases[1]
+        if status is not None:
+            assert (second.status, second.time) == (status, pytest.approx(1.0))
+        assert (second.holds[0].loss_time is None) == (status is None)
+
+
+def test_what_is_optimised_waits_by_either_contact(sliding):
+    scene, traced, _ = sliding
+    optimum = wa.optimise(scene, traced=traced)
+    assert optimum.result.status is Status.OK, optimum.result.message
+    assert all(held.margin > 0 for held in optimum.result.phases[1].holds)
+
+
+def test_a_hand_over_that_no_torque_survives_is_named():
+    scene, _, over = hand_over_of(box_scene(ROLL))
+    assert over.margin < 0
+    optimum = wa.optimise(scene)
+    assert optimum.result.status is not Status.OK
+    assert "finger2:v3 hands over to finger2:e3 there, and no torque" in optimum.result.message
+    assert "hand over elsewhere" in optimum.result.message
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "may"),
+    [
+        (("finger2:v3",), ("finger2:e3",), True),
+        (("finger2:v3",), ("finger2:e2",), True),
+        (("finger2:e0",), ("finger2:e3 rolling",), True),
+        (("finger2:v3",), ("finger1:e3",), False),
+        (("finger2:v3",), ("finger2:v0",), False),
+        (("finger2:v3",), ("finger2:e0",), False),
+        (("finger2:away",), ("finger2:e0",), False),
+    ],
+)
+def test_which_contacts_may_hand_over(before, after, may):
+    assert may_hand_over(before, after, 4) is may
