@@ -20,6 +20,7 @@ RUNS = {  # what each runs, after `import NAME as module`
     "interruption": "run('--runs', '1', '--latest', '3')",
     "optimisation": "module.random_plans = lambda *_: (); run('--quick', '--knots', '8')",
     "planning": "module.PLANNERS = ('rolling', 'random tree'); run('--quick')",
+    "plan_executions": "run('--quick')",
     "prediction": "module.SORTS, module.TIMESTEP = {'stopping': 1}, 4e-4; run('--quick', '--seeds', '0')",
     "random_plans": "run('--count', '1', '--phases', '1')",
     "skipping": "module.problems = lambda **_: PROBLEMS(referred=False)[:1]; run('--quick')",

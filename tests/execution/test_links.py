@@ -92,3 +92,30 @@ def test_a_range_may_end_where_a_phase_does(crossing):
     assert unexpected_meetings(replace(crossing, scene=bounded), {range_end, "finger1 meets finger2"}) == {
         "finger1 meets finger2"
     }
+
+
+def test_a_tip_passes_round_the_other_fingers_end():
+    """A box that is slid left: finger 1's tip, beyond the other finger's end at first, is above the object at last."""
+    finger = {"length": 0.09, "inertia": 2e-3, "viscous": 0.02, "dry": 0.01, "torque_limit": 1.0}
+    phase = {"name": "left", "contacts": ["palm:v0", "palm:v1", "finger1:v2", "finger2:v3"], "toward": "x-"}
+    data = {
+        "title": "box",
+        "gravity": 9.81,
+        "hand": {f"finger{k}": finger | {"joint": [x, 0.0]} for k, x in ((1, 0.055), (2, -0.055))},
+        "object": {"vertices": [[0, 0], [0.044, 0], [0.044, 0.043], [0, 0.043]], "mass": 0.2, "friction": 0.1},
+        "start": {"x": 0.01, "y": 0.0215, "phi": 0.0, "theta1": 2.04, "theta2": 0.79},
+        "phase": [phase | {"until": {"x": -0.01}, "duration": 1.0}],
+    }
+    optimum = wa.optimise(wa.parse(data), knots=21)
+    first, last = (np.asarray(z) for z in (optimum.result.phases[0].traced.begin, optimum.result.phases[0].traced.end))
+    sides = [above_other_finger(z, optimum.scene.hand) for z in (first, last)]
+    assert sides[0] > 0 > sides[1]  # else nothing passes
+    done = execute(optimum.result)
+    assert (done.ending, done.link_contacts) == (ExecutionOutcome.OK, {}), done.message
+
+
+def above_other_finger(z, hand):
+    """How far finger 1's tip is on the outer side of finger 2's line [m]."""
+    joint, length = np.asarray(hand.joint), np.asarray(hand.length)
+    tip = joint[0] + length[0] * np.array([np.cos(z[3]), np.sin(z[3])]) - joint[1]
+    return float(np.cos(z[4]) * tip[1] - np.sin(z[4]) * tip[0])

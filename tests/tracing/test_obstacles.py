@@ -10,7 +10,7 @@ from scipy.optimize import brentq, root
 from support import layered, steadiest_difference
 
 import wholearm_jax as wa
-from wholearm_jax.files.scene_toml import to_dict
+from wholearm_jax.files.scene_toml import parse_start, to_dict
 from wholearm_jax.model import rigid_body, scaled_mechanics
 from wholearm_jax.phases import describe_end
 from wholearm_jax.phases.obstacles import describe_overlaps
@@ -205,3 +205,27 @@ def test_layered_fingers_do_not_stop_the_path(flip):
     scene, _ = flip
     (found,) = wa.trace(eqx.tree_at(lambda s: s.hand.layered, scene, jnp.asarray(True)))
     assert int(found.path.end_reason) != PathEnd.OBSTACLE
+
+
+@pytest.mark.parametrize("deeper", [0.0, 1e-12, -1e-12, 1e-11, -1e-11, 3e-10])
+def test_a_tip_that_lies_flush_on_a_side_is_not_inside(deeper):
+    """Where the line of a flush finger crosses the object is decided by rounding: it is no depth of the finger."""
+    side, joint, theta, length = 0.07, -0.08, 0.8, 0.11
+    fingers = {
+        f"finger{k}": {"joint": [x, 0.0], "length": length, "inertia": 2e-3, "torque_limit": 1.0}
+        for k, x in ((1, 0.2), (2, joint))
+    }
+    square = [[0.0, 0.0], [side, 0.0], [side, side], [0.0, side]]
+    data = {"title": "", "gravity": 9.81, "hand": fingers, "object": {"vertices": square, "mass": 0.2, "friction": 0.1}}
+    data |= {"start": dict.fromkeys(("x", "y", "phi", "theta1", "theta2"), 0.0), "phase": []}
+    scene = parse_start(data)
+    along, phi = np.array([np.cos(theta), np.sin(theta)]), theta + np.pi
+    turn = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]])
+    centre = np.array([joint, 0.0]) + 0.12 * along + turn @ [side / 2, side / 2]
+
+    def lines(by):
+        every = describe_overlaps(scene, jnp.asarray([*centre, phi, 1.0, theta - by]))
+        return [line for line in every if line.startswith("finger2")]
+
+    assert lines(deeper) == []
+    assert "inside the object" in lines(0.01)[0]

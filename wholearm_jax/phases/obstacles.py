@@ -20,6 +20,7 @@ from wholearm_jax.model import (
 )
 from wholearm_jax.tracing import hold_same_tip, run_into_object
 
+STRETCH_PLACES = 17  # of a link's stretch in the object, at which its depth is looked at
 LEVEL_ANGLE = 1e-9  # [rad], within which a finger is level with the palm
 
 
@@ -117,7 +118,7 @@ def _object_overlaps(scene: Scene, z, tolerance: float) -> list[str]:
     lower, upper = (a.reshape(5, capacity)[:, :count] for a in (lower, upper))
     lines = []
     for link in range(3):  # the first three groups are vertices on the palm and on the fingers
-        line = _link_in_object(link, gap[link], along[link], lower[link, 0], upper[link, 0])
+        line = _link_in_object(link, gap[link], along[link], lower[link, 0], upper[link, 0], tolerance)
         if line is not None and line[0] > tolerance:
             depth, feature = line
             size = f"{1e3 * depth:.3g} mm"
@@ -137,8 +138,12 @@ def _object_pairs(scene: Scene, z):
     return contact_kinematics(contacts, z), contacts.lower, contacts.upper
 
 
-def _link_in_object(link: int, gap, along, lower: float, upper: float) -> tuple[float, str] | None:
-    """Return how deep a link lies in a polygon given by its vertices' places in the link's frame, and where."""
+def _link_in_object(link: int, gap, along, lower: float, upper: float, tolerance: float) -> tuple[float, str] | None:
+    """Return how deep a link lies in a polygon given by its vertices' places in the link's frame, and where.
+
+    A link that is nowhere farther inside than the tolerance is flush with a side; where its line crosses the polygon,
+    and with which vertices beside it, is then decided by rounding.
+    """
     following = np.roll(np.arange(len(gap)), -1)
     inside = []  # stretches of the link's line within the polygon
     crossing = np.flatnonzero((gap > 0) != (gap[following] > 0))
@@ -148,7 +153,7 @@ def _link_in_object(link: int, gap, along, lower: float, upper: float) -> tuple[
         begin, end = max(begin, lower), min(end, upper)
         if end > begin:
             inside.append((begin, end))
-    if not inside:
+    if not inside or _depth_inside(inside, np.stack([along, gap], axis=1)) <= tolerance:
         return None
     within = (along >= min(inside)[0] - 1e-12) & (along <= max(end for _, end in inside) + 1e-12)
     longest = max(end - begin for begin, end in inside)
@@ -158,3 +163,12 @@ def _link_in_object(link: int, gap, along, lower: float, upper: float) -> tuple[
         deepest = int(np.argmax(depth))
         depths += [(float(depth[deepest]), f"vertex {deepest}")] if depth[deepest] > 0 else []
     return min(depths, default=None)
+
+
+def _depth_inside(stretches: list[tuple[float, float]], corners: Float[np.ndarray, "corners 2"]) -> float:
+    """Return the largest distance of places along stretches of the x-axis from a polygon's boundary."""
+    places = np.concatenate([np.linspace(begin, end, STRETCH_PLACES) for begin, end in stretches])
+    points, edges = np.stack([places, np.zeros_like(places)], axis=1)[:, None], np.roll(corners, -1, 0) - corners
+    share = ((points - corners) * edges).sum(2) / (edges**2).sum(1)
+    nearest = corners + np.clip(share, 0.0, 1.0)[..., None] * edges
+    return float(np.linalg.norm(points - nearest, axis=2).min(1).max())
