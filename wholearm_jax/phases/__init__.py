@@ -13,7 +13,13 @@ from wholearm_jax.phases.closed_loop import (
 from wholearm_jax.phases.closed_loop_result import closed_loop_result
 from wholearm_jax.phases.compressive_margin import margin
 from wholearm_jax.phases.gradients import check_gradient
-from wholearm_jax.phases.hand_overs import HandOver, find_hand_over, find_hand_overs, hand_over_contacts
+from wholearm_jax.phases.hand_overs import (
+    HandOver,
+    find_hand_over,
+    find_hand_overs,
+    hand_over_contacts,
+    possible_hand_overs,
+)
 from wholearm_jax.phases.obstacles import describe_overlaps
 from wholearm_jax.phases.phase_ends import (
     configuration,

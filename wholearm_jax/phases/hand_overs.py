@@ -13,6 +13,8 @@ with torques over their limits and the surplus `d` that `LEAST_SURPLUS` says: an
 linear in the torque and `m`: linear programmes.
 """
 
+import itertools
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -31,11 +33,10 @@ from wholearm_jax.margin import (
     cone_facets,
     contact_statics,
 )
-from wholearm_jax.model import FEATURE_GROUPS, Arrival, Phase, Scene, feature_pair, parse_contact
-from wholearm_jax.phases.phase_ends import ends_at_stop
+from wholearm_jax.model import AWAY_NAMES, EDGE, Arrival, Phase, Scene, feature_pair, parse_contact, rigid_body
 from wholearm_jax.phases.phase_tracing import TracedPhase
-from wholearm_jax.tracing import PathEnd
 
+POINT_TOL = 1e-6  # distance of a tip from a vertex, in the object's radius, at which the two are one point
 LEAST_SURPLUS = 0.03  # of the torques that brake or move the object, over the limits, beyond those that only balance
 
 
@@ -131,17 +132,44 @@ def hand_over_contacts(scene: Scene, before: Phase, path: TracedPhase, after: Ph
     if not at_rest or before.regrasp or after.regrasp or int(path.dynamics.status) != Status.OK:
         return None
     held, then = (tuple(map(feature_pair, phase.formation.names)) for phase in (before, after))
-    reason, index = int(path.path.end_reason), int(path.path.end_contact)
-    if reason == PathEnd.FEATURE_END:
-        old = held[before.formation.contact_of_row[index]]
-        link = parse_contact(old)[0]
-    elif reason == PathEnd.CONTACT_MADE and not ends_at_stop(scene, before, path):
-        link = FEATURE_GROUPS[index // scene.object.vertices.shape[0]][0]
-    else:
-        return None
-    gone = [name for name in held if parse_contact(name)[0] == link and name not in then]
-    new = [name for name in then if parse_contact(name)[0] == link and name not in held]
-    return (gone[0], new[0]) if gone and new else None
+    for old, new, vertex in possible_hand_overs(held, then, int(scene.object.count)):
+        if _tip_to_vertex(scene, path.end, parse_contact(old)[0] - 1, vertex) < POINT_TOL:
+            return old, new
+    return None
+
+
+def possible_hand_overs(before: Sequence[str], after: Sequence[str], vertices: int) -> Iterator[tuple[str, str, int]]:
+    """Yield contacts of a finger, at least one of them by its tip, of which one may take over from another at a vertex.
+
+    Args:
+        before: names of the contacts of one phase.
+        after: those of the next.
+        vertices: how many vertices the object has.
+    """
+    gone = [name for name in before if name not in (*after, *AWAY_NAMES)]
+    new = [name for name in after if name not in (*before, *AWAY_NAMES)]
+    for one, other in itertools.product(gone, new):
+        (link, kind, *_), (other_link, other_kind, *_) = parse_contact(one), parse_contact(other)
+        if link == other_link and EDGE in (kind, other_kind):
+            for vertex in _vertices(one, vertices) & _vertices(other, vertices):
+                yield one, other, vertex
+
+
+def _vertices(contact: str, count: int) -> set[int]:
+    """Return the vertices at a contact's feature."""
+    _, kind, feature, _ = parse_contact(contact)
+    return {feature, (feature + 1) % count} if kind == EDGE else {feature}
+
+
+def _tip_to_vertex(scene: Scene, z, finger: int, vertex: int) -> float:
+    """Return how far a finger's tip is from a vertex, in the object's radius."""
+    z, hand = np.asarray(z), jax.device_get(scene.hand)
+    corners = np.asarray(rigid_body(scene.object).vertices)
+    turned, along = (np.array([np.cos(angle), np.sin(angle)]) for angle in (z[2], z[3 + finger]))
+    offset = (1.0, -1.0)[finger] * hand.offset[finger] * np.array([-along[1], along[0]])
+    tip = hand.joint[finger] + hand.length[finger] * along + offset
+    at = z[:2] + corners[vertex, 0] * turned + corners[vertex, 1] * np.array([-turned[1], turned[0]])
+    return float(np.hypot(*(tip - at)) / np.hypot(*corners.T).max())
 
 
 def _one_contact(scene: Scene, name: str, phase: Phase, path: TracedPhase, end: int) -> OneContact:

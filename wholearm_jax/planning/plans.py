@@ -1,6 +1,5 @@
 """Plans: phases that lead to a goal, each with its certificate, and what a search for them returns."""
 
-import itertools
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -9,7 +8,7 @@ from jaxtyping import Float
 
 from wholearm_jax.core import CachedJit, Status, as_device_array
 from wholearm_jax.margin import margin_upper_bound
-from wholearm_jax.model import AWAY_NAMES, EDGE, Phase, Scene, contact_formation, parse_contact, path_target
+from wholearm_jax.model import Phase, Scene, contact_formation, path_target
 from wholearm_jax.phases import describe_end, find_hand_overs, trace
 from wholearm_jax.planning.goal import Goal
 
@@ -110,22 +109,6 @@ def _as_scene(scene: Scene, start: Float[np.ndarray, "5"], steps: tuple[Step, ..
         for k, step in enumerate(steps)
     )
     return eqx.tree_at(lambda s: (s.start, s.phases), scene, (as_device_array(start), phases))
-
-
-def may_hand_over(before: tuple[str, ...], after: tuple[str, ...], vertices: int) -> bool:
-    """Say whether one contact of a finger may take over from another at a vertex, at least one of them by its tip."""
-    gone, new = set(before) - set(after), set(after) - set(before)
-    pairs = itertools.product(map(parse_contact, gone - {*AWAY_NAMES}), map(parse_contact, new - {*AWAY_NAMES}))
-    return any(
-        one[0] == other[0] and EDGE in (one[1], other[1]) and _vertices(one, vertices) & _vertices(other, vertices)
-        for one, other in pairs
-    )
-
-
-def _vertices(contact: tuple[int, int, int, bool], count: int) -> set[int]:
-    """Return the vertices at a contact's feature."""
-    _, kind, feature, _ = contact
-    return {feature, (feature + 1) % count} if kind == EDGE else {feature}
 
 
 def survives_hand_over(scene: Scene, begin: Float[np.ndarray, "5"], steps: tuple[Step, Step], duration: float) -> bool:

@@ -20,7 +20,7 @@ import numpy as np
 
 from wholearm_jax.core import as_device_array, require_x64
 from wholearm_jax.model import ANGLE_COORDINATES, AWAY_NAMES, COORDINATES, Scene, feature_pair, rigid_body
-from wholearm_jax.phases import trace
+from wholearm_jax.phases import possible_hand_overs, trace
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import Move, moves_from
 from wholearm_jax.planning.obstructions import explain_failure
@@ -30,7 +30,6 @@ from wholearm_jax.planning.plans import (
     PlanningResult,
     Step,
     make_plan,
-    may_hand_over,
     survives_hand_over,
 )
 from wholearm_jax.planning.regrasps import regrasp_stops, separate_regrasps
@@ -252,7 +251,7 @@ def _hand_over_check(search: _Search, steps: tuple[Step, ...]) -> Callable[[Move
     count, known, last = int(rigid_body(search.scene.object).count), {}, steps[-1] if steps else None
 
     def survives(move: Move, step: Step) -> bool:
-        if last is None or last.until is not None or not may_hand_over(last.contacts, move.contacts, count):
+        if last is None or not any(possible_hand_overs(last.contacts, move.contacts, count)):
             return True
         if move.contacts not in known:
             begin = steps[-2].end if len(steps) > 1 else search.start
