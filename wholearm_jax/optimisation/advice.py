@@ -114,7 +114,7 @@ def _impossible_hand_overs(result: Result, traced: tuple[TracedPhase, ...]) -> d
 def _explain_hand_over(phase: PhaseResult, hand_over: HandOver) -> PhaseResult:
     """Name the contacts of a hand-over that no torque survives."""
     old, new = (one.name for one in hand_over)
-    detail = f"{old} hands over to {new} there, and no torque holds and moves the object under either"
+    detail = f"{old} hands over to {new} there, and no torque stops and starts the object under either"
     return replace(phase, detail=detail, remedy=REMEDY_LOST_HAND_OVER)
 
 

@@ -1,9 +1,9 @@
 r"""Hand-overs: where a vertex on a finger reaches its tip, the tip goes on along an edge, or the other way round.
 
 The object rests where one phase ends and the next begins, at a place at which the vertex and the tip coincide. Which of
-the two contacts holds it there is decided by less than a micrometre. So the torque that holds it must do so by either
-contact; and there must be torques that press both contacts while they brake the object, however it arrives, and while
-they move it on:
+the two contacts holds it there is decided by less than a micrometre. So there must be torques that press either contact
+while they brake the object, however it arrives, and while they move it on; and where it waits, the torque must hold it
+by either:
 
     arrives:  c_n >= m,   a <= -d |da/dtau|     at the end of the one path and at the start of the other
     stays:    some forces within both sets of limits (`margin.statics`) with c_n >= m
@@ -62,8 +62,8 @@ class HandOver(NamedTuple):
 
     @property
     def margin(self) -> float:
-        """The least of the largest margins with which the object arrives, stays and starts [N]; negative: it cannot."""
-        return min(best.margin for best in (self.best_motion(-1.0), self.best_hold(), self.best_motion(1.0)))
+        """The smaller of the largest margins with which the object arrives and starts [N]; negative: it cannot."""
+        return min(self.best_motion(sign).margin for sign in (-1.0, 1.0))
 
     def best_hold(self) -> StaticMargin:
         """Compute the torque that holds the object by either contact with the largest margin.
