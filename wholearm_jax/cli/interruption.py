@@ -98,6 +98,7 @@ def quiet_workers() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        os.environ["PYTHONWARNINGS"] = others or ""
 
 
 def _end_workers() -> None:

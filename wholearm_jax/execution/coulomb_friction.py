@@ -56,7 +56,7 @@ def advance(
 
 def has_given_up(data) -> bool:
     """Whether the motion became unstable, at this step or before."""
-    return any(warning.number for warning in data.warning)
+    return bool(data.warning.number.any())  # once an array: a loop over warnings takes as long as a step
 
 
 def _settled(bodies: MujocoModel, data, pair, address, rows, ct, push) -> tuple[Float[np.ndarray, "touching"], float]:
@@ -101,7 +101,7 @@ def _touching(
     rows = np.zeros((len(touching), 5))
     rows[:, 0], rows[:, 1] = tangent_x, tangent_y
     rows[:, 2] = tangent_y * (x - data.qpos[0]) - tangent_x * (y - data.qpos[1])
-    for finger, (joint_x, joint_y) in enumerate(bodies.hand.joint):
+    for finger, (joint_x, joint_y) in enumerate(bodies.acting.hand.joint):
         turning = tangent_x * (y - joint_y) - tangent_y * (x - joint_x)
         rows[:, 3 + finger] = np.where(bodies.link[pair] == finger + 1, turning, 0.0)
     return pair, contact.efc_address[touching], rows

@@ -56,7 +56,6 @@ from wholearm_jax.model import (
     EDGE,
     LINKS,
     VERTEX,
-    Hand,
     Scene,
     contact_candidates,
     contact_name,
@@ -106,8 +105,8 @@ class MujocoModel:
 
     `pair[geom1, geom2]` is the row of `names`, or after them of `link_meetings`, that two shapes belong to (-1: none);
     `toward[row]` is 1 where MuJoCo's contact normal points into the object and -1 where it points out of it. Each row
-    of `names` has its `link` and its `friction` coefficient; `acting` says which pairs act when; `hand`
-    is the scene's, and `mobility` the diagonal of `M^-1`. `xml` is the model as MJCF, always with MuJoCo's friction.
+    of `names` has its `link` and its `friction` coefficient; `acting` says which pairs act when, and
+    `mobility` is the diagonal of `M^-1`. `xml` is the model as MJCF, always with MuJoCo's friction.
     """
 
     model: mujoco.MjModel
@@ -118,7 +117,6 @@ class MujocoModel:
     toward: Int[np.ndarray, "rows"]
     link: Int[np.ndarray, "rows"]
     friction: Float[np.ndarray, "rows"]
-    hand: Hand
     mobility: Float[np.ndarray, "5"]
     softness: ContactCompliance
     xml: str
@@ -159,7 +157,6 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
         toward=toward,
         link=link,
         friction=np.asarray(solid.friction)[link],
-        hand=hand,
         mobility=1 / inertia,
         softness=softness,
         xml=spec.to_xml(),

@@ -71,6 +71,7 @@ class HandOver(NamedTuple):
         Of torques with nearly this margin it is that which is farthest from those that move the object.
         """
         programme, limit = self._programme()
+        programme.add_variables("apart", 0.0, 0.0)
         for prefix, one in zip(("before_", "after_"), self, strict=True):
             press = self.before.statics.unit / one.statics.unit
             one.statics.add_forces(programme, level="level", press=press, torque_unit=limit, prefix=prefix)
@@ -97,11 +98,10 @@ class HandOver(NamedTuple):
         return self._margin(float(best.values["level"][0]), best)
 
     def _programme(self) -> tuple[LinearProgramme, Float[np.ndarray, "2"]]:
-        """Begin a programme: torques over their limits, the margin over the unit of force, distance from limits."""
+        """Begin a programme: torques over their limits, and the margin over the unit of force."""
         programme = LinearProgramme()
         programme.add_variables("torque", -np.ones(2), np.ones(2))
         programme.add_variables("level", -np.inf, np.inf)
-        programme.add_variables("apart", 0.0, 0.0)
         return programme, self.before.statics.torque_limit
 
     def _margin(self, level: float, solution: LinearProgrammeSolution) -> StaticMargin:

@@ -112,7 +112,7 @@ def _as_scene(scene: Scene, start: Float[np.ndarray, "5"], steps: tuple[Step, ..
 
 
 def survives_hand_over(scene: Scene, begin: Float[np.ndarray, "5"], steps: tuple[Step, Step], duration: float) -> bool:
-    """Say whether torques hold and move the object under either contact between two steps, the first from `begin`."""
+    """Say whether torques stop and start the object under either contact between two steps, the first from `begin`."""
     planned = _as_scene(scene, begin, steps, duration)
     over = find_hand_overs(planned, trace(planned))[1]
     return over is None or over.margin > 0
