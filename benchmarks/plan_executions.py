@@ -14,6 +14,7 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Iterator
+from itertools import islice
 
 import numpy as np
 from measure import save
@@ -75,9 +76,7 @@ def carry_out(scene: wa.Scene) -> dict:
 def measure(count: int, seconds: float, seed: int, regrasp_cost: float | None) -> list[dict]:
     """Carry out so many plans."""
     rows = []
-    for about, scene in plans(seconds, seed, regrasp_cost):
-        if len(rows) == count:
-            break
+    for about, scene in islice(plans(seconds, seed, regrasp_cost), count):
         rows.append(about | carry_out(scene))
         row = rows[-1]
         print(

@@ -4,8 +4,7 @@ The coordinates are those of the prediction, `z = (x, y, phi, theta1, theta2)`: 
 a hinge for each finger. Fingers have inertia J about their joint (and their centre of mass on it, so that gravity acts
 on the object alone, as in eqs. 1-3), viscous friction B and dry friction D. No contact formation is assumed: all pairs
 of features that may touch (`contact_set.contact_candidates`) are pairs of shapes that MuJoCo tests at every step. The
-shapes
-make MuJoCo's distances equal the C-functions:
+shapes make MuJoCo's distances equal the C-functions:
 
 - an object vertex and a fingertip are dots, spheres of radius `r`, a hundred-thousandth of the object's;
 - the palm and a finger's contact edge are slabs whose face lies `r` behind the line, so that a dot whose centre is on
@@ -19,18 +18,8 @@ against the palm, without friction; ranges are joint limits. Layered fingers do 
 
 Slabs are thicker than what they stand for: which pairs act is chosen before every step (`acting_pairs`).
 
-A vertex under load is a little inside the finger, and so is the tip inside the object when the vertex passes it, where
-no edge's wedge would catch it. So a finger's face goes on beyond its tip (`_tip_extension`), by ten times of what
-contacts sag under a load of five weights: 18 micrometres at a step of 0.2 ms, 1 at 0.05 ms.
-
-The links are bodies among themselves, too: fingertips and joints are dots against the other finger, and fingertips
-against the palm, without friction; ranges are joint limits. Layered fingers do not meet.
-
-Slabs are thicker than what they stand for, so two kinds of pairs act only where they should (`choose_pairs`, before
-every step). A fingertip touches an edge only where its finger comes from the edge's outer side: from the inner side the
-finger meets an end of the edge first, and a tip that slips past that vertex, a little inside it, would catch on the
-edge. And a dot meets that face of the other finger on whose side it last was beyond that finger's end, around which it
-may pass.
+Where a finger's contact edge passes through its joint, finger and palm make a corner. Both go on a little beyond the
+joint, the finger below the palm, so that a vertex pressed into the corner does not slip out between them.
 
 A pair thus touches at one point of the plane. If `a_free` is the acceleration of the gap `C` without the contact, then
 
@@ -67,6 +56,7 @@ POINT_RADIUS = 1e-5  # radius of a dot [object radii]: far above rounding, its l
 PAIR_DISTANCE = (
     1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
 )
+CORNER = 2e-3  # by how much finger and palm go on beyond the joint [object radii]
 HALF_SPACE_DEPTH = 0.2  # slabs, and all shapes in depth [object radii]
 
 
@@ -209,7 +199,8 @@ def _add_hand(spec, hand, size, compliance):
     """
     left, right = float(hand.joint[1, 0]), float(hand.joint[0, 0])
     thick, dot = HALF_SPACE_DEPTH * size, POINT_RADIUS * size
-    _add_slab(spec.worldbody, "palm", left, right, -dot, -1.0, thick)
+    beyond = [CORNER * size * (float(offset) <= 0) for offset in hand.offset]
+    _add_slab(spec.worldbody, "palm", left - beyond[1], right + beyond[0], -dot, -1.0, thick)
     for k, (name, side) in enumerate(zip(LINKS[1:], (1.0, -1.0), strict=True)):
         length, offset = float(hand.length[k]), float(hand.offset[k])
         finger = _add_body(spec, name, [*np.asarray(hand.joint[k]), 0], hand.inertia[k], 1.0)
@@ -227,7 +218,7 @@ def _add_hand(spec, hand, size, compliance):
             solref_limit=compliance["solref"],
             solimp_limit=compliance["solimp"],
         )
-        _add_slab(finger, name, 0.0, length, side * offset - side * dot, -side, thick)
+        _add_slab(finger, name, -beyond[k], length, side * offset - side * dot, -side, thick)
         _add_geom(finger, f"{name}_tip", "SPHERE", [dot, 0, 0], [length, side * offset, 0])
         back = float(hand.back[k])
         _add_slab(finger, f"{name}_back", 0.0, length, -side * (back - dot), side, thick)
