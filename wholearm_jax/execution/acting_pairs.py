@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from wholearm_jax.model import EDGE, LINKS, Hand, parse_contact
 
@@ -34,12 +34,12 @@ class FacePairs:
     """Pairs of a finger's dot and the faces of the other finger: that toward the object, and its back.
 
     `row` has MuJoCo's pairs with either face, `finger` (0 or 1) is the one with the faces and `dot` the other one's
-    place in its own frame, whose x-axis is the finger.
+    place in its own frame, whose x-axis is the finger, as `x + iy`.
     """
 
     row: Int[np.ndarray, "dots 2"]
     finger: Int[np.ndarray, "dots"]
-    dot: Float[np.ndarray, "dots 2"]
+    dot: Complex[np.ndarray, "dots"]
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def _face_pairs(model: mujoco.MjModel, hand) -> FacePairs:
     return FacePairs(
         np.array(rows, int).reshape(-1, 2),
         np.array([1 - k for k, _, _ in dots], int),
-        np.array([at for _, _, at in dots], float).reshape(-1, 2),
+        np.array([complex(*at) for _, _, at in dots], complex),
     )
 
 
@@ -94,12 +94,11 @@ def choose_pairs(
 def _choose_faces(model: mujoco.MjModel, acting: ActingPairs, angles: Float[np.ndarray, "2"], everywhere: bool) -> None:
     """Let dots that are beyond the other finger's end, or all, meet that of its faces on whose side they are."""
     hand, faces = acting.hand, acting.faces
-    along = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
     other, finger = 1 - faces.finger, faces.finger
-    dot = hand.joint[other] + faces.dot[:, :1] * along[other] + faces.dot[:, 1:] * across[other] - hand.joint[finger]
-    height = np.array([1.0, -1.0])[finger] * (dot * across[finger]).sum(1)  # toward the object
-    beyond = everywhere | ((dot * along[finger]).sum(1) > hand.length[finger])
+    turn, joint = np.exp(1j * angles), hand.joint @ np.array([1, 1j])
+    dot = (joint[other] + faces.dot * turn[other] - joint[finger]) / turn[finger]  # in the frame of the faces
+    height = np.array([1.0, -1.0])[finger] * dot.imag  # toward the object
+    beyond = everywhere | (dot.real > hand.length[finger])
     before = height > (hand.offset - hand.back)[finger] / 2
     _act(model, acting, faces.row[beyond], np.stack([before, ~before], axis=1)[beyond])
 

@@ -9,22 +9,36 @@ that touch, `G = J_t M^-1 J_t'`, `h` the time step and `v_t` the slips after it.
 
     c_t <- clip(c_t - v_t / (h sum_j |G_ij|), -mu c_n, mu c_n)
 
-is repeated, MuJoCo answering each time with `c_n` and the accelerations, until no force changes: each contact sticks,
-`v_t = 0`, or has `|c_t| = mu c_n` against its slip. Contacts that all stick converge whatever their number, because
-`G` over its rows' sums has no eigenvalue beyond 1.
+leaves forces as they are where each contact sticks, `v_t = 0`, or has `|c_t| = mu c_n` against its slip. It is
+repeated, MuJoCo answering each time with `c_n` and the accelerations, until no force changes. Contacts that all stick
+converge whatever their number, because `G` over its rows' sums has no eigenvalue beyond 1; but slowly. So for each
+guess of which contacts press, stick and slide in which direction, the forces are once those with which it would be
+right: a linear system (`_forces_if`). One or two guesses are enough in nearly all steps.
 """
 
 # MuJoCo's names come from a compiled module, which type checkers cannot see into.
 # pyright: reportAttributeAccessIssue=false
 
+from typing import NamedTuple
+
 import mujoco
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from wholearm_jax.execution.acting_pairs import choose_pairs
 from wholearm_jax.execution.mujoco_model import MujocoModel
 
 EXACT, ROUNDS = 1e-6, 100  # when to stop: share of the largest friction by which forces still change; rounds at most
+
+
+class Touching(NamedTuple):
+    """The contacts that touch at a step."""
+
+    pair: Int[np.ndarray, "touching"]  # rows of the model's `names`
+    address: Int[np.ndarray, "touching"]  # where MuJoCo keeps their normal forces
+    slip: Float[np.ndarray, "touching 5"]  # `J_t`
+    friction: Float[np.ndarray, "touching"]  # coefficients
+    mobility: Float[np.ndarray, "touching"]  # `h sum_j |G_ij|`
 
 
 def advance(
@@ -43,14 +57,14 @@ def advance(
     choose_pairs(bodies.model, bodies.acting, data.qpos)
     mujoco.mj_step1(bodies.model, data)
     data.ctrl[:] = torque
-    pair, address, rows = _touching(bodies, data)
-    friction, wrong = _settled(bodies, data, pair, address, rows, before[pair, 1], push)
-    data.qfrc_applied[:] = friction @ rows + push
+    touching = _touching(bodies, data)
+    friction, wrong = _settled(bodies, data, touching, before[touching.pair, 1], push)
+    data.qfrc_applied[:] = friction @ touching.slip + push
     mujoco.mj_step2(bodies.model, data)
     if has_given_up(data):  # it has begun anew, and its contacts are others
         return np.full_like(before, np.nan), np.inf
     forces = np.zeros_like(before)
-    np.add.at(forces, pair, np.stack([data.efc_force[address], friction], axis=1))
+    np.add.at(forces, touching.pair, np.stack([data.efc_force[touching.address], friction], axis=1))
     return forces, wrong
 
 
@@ -59,32 +73,78 @@ def has_given_up(data) -> bool:
     return bool(data.warning.number.any())  # once an array: a loop over warnings takes as long as a step
 
 
-def _settled(bodies: MujocoModel, data, pair, address, rows, ct, push) -> tuple[Float[np.ndarray, "touching"], float]:
+def _settled(
+    bodies: MujocoModel, data, touching: Touching, ct: Float[np.ndarray, "touching"], push
+) -> tuple[Float[np.ndarray, "touching"], float]:
     """Friction forces that agree with Coulomb's law, and by how much slips do not [m/s]."""
-    if not len(pair):
+    if not len(ct):
         return ct, 0.0
-    step, mu = bodies.model.opt.timestep, bodies.friction[pair]
-    most_mobile = step * np.abs((rows * bodies.mobility) @ rows.T).sum(1)
+    step, wrong, tried = bodies.model.opt.timestep, np.inf, set()
     mujoco.mj_fwdActuation(bodies.model, data)
-    wrong = np.inf
     for _ in range(ROUNDS):
-        data.qfrc_applied[:] = ct @ rows + push
+        data.qfrc_applied[:] = ct @ touching.slip + push
         mujoco.mj_fwdAcceleration(bodies.model, data)
         mujoco.mj_fwdConstraint(bodies.model, data)
-        most = mu * data.efc_force[address]
-        slip = rows @ (data.qvel + step * data.qacc)
-        wanted = np.minimum(np.maximum(ct - slip / most_mobile, -most), most)
-        change, ct = np.abs(wanted - ct), wanted
-        wrong = (most_mobile * change).max()
+        most = touching.friction * data.efc_force[touching.address]
+        speed = touching.slip @ (data.qvel + step * data.qacc)
+        wanted = np.minimum(np.maximum(ct - speed / touching.mobility, -most), most)
+        change = np.abs(wanted - ct)
+        wrong = (touching.mobility * change).max()
         if change.max() <= EXACT * most.max():
-            break
+            return wanted, float(wrong)
+        yields, slides = _yielding(data), np.where(np.abs(wanted) < most, 0.0, np.sign(wanted))
+        guess = (yields.tobytes(), slides.tobytes())
+        ct = wanted if guess in tried else _forces_if(slides, yields, bodies, data, touching, ct)
+        tried.add(guess)
     return ct, float(wrong)
 
 
-def _touching(
-    bodies: MujocoModel, data
-) -> tuple[Int[np.ndarray, "touching"], Int[np.ndarray, "touching"], Float[np.ndarray, "touching 5"]]:
-    """Contacts that touch: their rows of `names`, where MuJoCo keeps their normal forces, and `J_t`.
+def _yielding(data) -> Bool[np.ndarray, "constraints"]:
+    """Which of MuJoCo's constraints have forces that follow the accelerations: neither off nor at their limits."""
+    limit = data.efc_frictionloss  # of joints with dry friction; 0 of contacts and of ranges
+    return np.where(limit > 0, np.abs(data.efc_force) < limit, data.efc_force > 0)
+
+
+def _forces_if(
+    slides: Float[np.ndarray, "touching"],
+    yields: Bool[np.ndarray, "constraints"],
+    bodies: MujocoModel,
+    data,
+    touching: Touching,
+    ct: Float[np.ndarray, "touching"],
+) -> Float[np.ndarray, "touching"]:
+    """Friction forces if contacts stick (0) or slide with a force in a direction, and what yields now does.
+
+    With `J`, `D` and `a_ref` of MuJoCo's constraints that yield, `f = D (a_ref - J a)`, accelerations `a` follow from
+
+        M a = F + J' f + J_t' c_t,    c_t = slides mu f    or    J_t (v + h a) = -c (c_t - c_t now)
+
+    where `c` is `EXACT` squared of how mobile the contact is, so that friction is determined where several contacts
+    stick.
+    """
+    sticks, count = slides == 0, np.count_nonzero(slides == 0)
+    jacobian, stiffness = data.efc_J.reshape(-1, 5)[: len(yields)], np.where(yields, data.efc_D, 0.0)
+    normal, a_ref, stiff = (each[touching.address] for each in (jacobian, data.efc_aref, stiffness))
+    # All forces but those of constraints that yield and of contacts that slide, which follow the accelerations.
+    force = data.qfrc_smooth - ct[~sticks] @ touching.slip[~sticks] + np.where(yields, 0.0, data.efc_force) @ jacobian
+    sliding = touching.slip * (slides * touching.friction * stiff)[:, None]
+    system = np.zeros((5 + count, 5 + count))
+    system[:5, :5] = (jacobian.T * stiffness) @ jacobian + sliding.T @ normal
+    system[:5, :5] += np.diag(1 / bodies.mobility)
+    system[:5, 5:], system[5:, :5] = -touching.slip[sticks].T, bodies.model.opt.timestep * touching.slip[sticks]
+    system[5:, 5:] = np.diag(EXACT**2 * touching.mobility[sticks])
+    known = np.append(
+        force + (stiffness * data.efc_aref) @ jacobian + a_ref @ sliding, -touching.slip[sticks] @ data.qvel
+    )
+    solution = np.linalg.solve(system, known)
+    most = touching.friction * np.maximum(stiff * (a_ref - normal @ solution[:5]), 0.0)
+    found = slides * most
+    found[sticks] = np.clip(ct[sticks] + solution[5:], -most[sticks], most[sticks])
+    return found
+
+
+def _touching(bodies: MujocoModel, data) -> Touching:
+    """Find the contacts that touch.
 
     `c_t` is positive along the normal that points into the object, turned by -90 degrees.
     """
@@ -104,4 +164,5 @@ def _touching(
     for finger, (joint_x, joint_y) in enumerate(bodies.acting.hand.joint):
         turning = tangent_x * (y - joint_y) - tangent_y * (x - joint_x)
         rows[:, 3 + finger] = np.where(bodies.link[pair] == finger + 1, turning, 0.0)
-    return pair, contact.efc_address[touching], rows
+    mobility = bodies.model.opt.timestep * np.abs((rows * bodies.mobility) @ rows.T).sum(1)
+    return Touching(pair, contact.efc_address[touching], rows, bodies.friction[pair], mobility)

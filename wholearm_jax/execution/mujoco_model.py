@@ -57,6 +57,7 @@ PAIR_DISTANCE = (
     1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
 )
 CORNER = 2e-3  # by how much finger and palm go on beyond the joint [object radii]
+LINK_GIVE = 1e-3  # how far contacts between links give way, over those with the object
 HALF_SPACE_DEPTH = 0.2  # slabs, and all shapes in depth [object radii]
 
 
@@ -122,6 +123,7 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
     rows = _add_pairs(spec, solid, size, timestep, softness)
     meetings = _add_link_pairs(spec, hand, size, timestep, softness)
     model = spec.compile()
+    _let_fingers_give_way(model, hand)
     if softness.friction == "coulomb":
         model.pair_dim[:] = 1  # normal forces alone
     pair = np.full((model.ngeom, model.ngeom), -1)
@@ -151,6 +153,15 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
         softness=softness,
         xml=spec.to_xml(),
     )
+
+
+def _let_fingers_give_way(model, hand) -> None:
+    """Tell MuJoCo how fingers move under a force, which it takes to be not at all: they turn about their centres.
+
+    Contacts of links with each other are else so hard that no forces are found; those with the object hardly change.
+    """
+    for k, name in enumerate(LINKS[1:]):
+        model.body_invweight0[model.body(name).id, 0] = LINK_GIVE * hand.length[k] ** 2 / hand.inertia[k]
 
 
 def _world(scene, timestep, softness):
