@@ -5,12 +5,15 @@
 Two sets: friction of each link within 20 %, and that together with mass within 10 %, vertices within 0.5 mm and the
 start within 1 mm. Both loops see the same objects; success is within 0.5 mm and 0.01 rad of each object's own path
 end, the last contacts closed. The closed loop samples at 1 kHz, 1 ms late, with encoders of 4096
-counts and 1 % of torque noise.
+counts and 1 % of torque noise. The hexagon's flip begins at a limit of its motors, with which no law holds either set
+(it is executed all the same), so that it is here with stronger ones, too.
 """
 
 import argparse
 import time
 
+import equinox as eqx
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from measure import RESULTS, save
@@ -20,7 +23,7 @@ from wholearm_jax.ensembles import wilson_interval
 from wholearm_jax.execution import Amounts, Hardware, run_trials
 from wholearm_jax.plotting import LINK_COLOURS as COLOURS
 
-SCENES = ("heptagon", "hexagon", "tipping", "box", "flight", "passage")
+SCENES = ("heptagon", "hexagon", "hexagon, 2 N m", "tipping", "box", "flight", "passage")
 SETS = {
     "friction": Amounts(friction=0.2),
     "friction, mass, vertices, start": Amounts(friction=0.2, mass=0.1, geometry=5e-4, start=1e-3),
@@ -28,9 +31,18 @@ SETS = {
 MASS = 0.1  # half width of the mass that laws are designed for
 
 
+def load(name: str) -> wa.Scene:
+    """Load a bundled scene, `NAME` or `NAME, TORQUE_LIMIT N m`."""
+    name, *limit = name.removesuffix(" N m").split(", ")
+    scene = wa.load(name)
+    if limit:
+        scene = eqx.tree_at(lambda s: s.hand.torque_limit, scene, jnp.full(2, float(limit[0])))
+    return scene
+
+
 def measure_one(name: str, count: int, workers: int | None) -> dict:
     """Both loops on one plan."""
-    scene = wa.load(name)
+    scene = load(name)
     optimum = wa.optimise(scene)
     begun = time.perf_counter()
     controller = wa.feedback(scene, optimum.torque, mass=MASS)

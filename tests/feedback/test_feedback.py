@@ -12,7 +12,7 @@ from reference.feedback_law import Law
 import wholearm_jax as wa
 from wholearm_jax.core.errors import BadInput
 from wholearm_jax.execution import Amounts, ExecutionOutcome, Hardware, execute, run_trials
-from wholearm_jax.feedback import begin, step
+from wholearm_jax.feedback import HeldSet, begin, held_set, step
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +119,7 @@ def test_a_law_is_written_only_where_it_holds_the_whole_set(least, code, wholear
         return replace(controller, phases=tuple(replace(phase, margin=least) for phase in controller.phases))
 
     monkeypatch.setattr(importlib.import_module("wholearm_jax.feedback"), "feedback", design)
+    monkeypatch.setattr(importlib.import_module("wholearm_jax.feedback"), "held_set", lambda *_, **__: HeldSet(0.5, 2))
     given = ("optimise", "heptagon", "--feedback", "--robust", "friction=10%", "--knots", "11", "--out", tmp_path)
     status, _, err = wholearm(*given)
     assert status == code
@@ -126,6 +127,22 @@ def test_a_law_is_written_only_where_it_holds_the_whole_set(least, code, wholear
     assert (tmp_path / "controller.json").exists() == (code == 0)
     assert (tmp_path / "torque.csv").exists()
     assert ("would open" in err) == (code == 1)
+    assert ("a law holds --robust friction=5%; with torque limits 2 times as large" in err) == (code == 1)
+
+
+@pytest.mark.slow
+def test_what_holds_where_no_law_holds_the_whole_set():
+    """The hexagon's flip begins at a limit of its motors."""
+    scene = wa.load("hexagon")
+    schedule = wa.optimise(scene).torque
+    held = held_set(scene, schedule, friction=0.1, shape=0.0)
+    assert held.share in (0.25, 0.5, 0.75)
+    assert held.motors in (1.5, 2.0)
+    with_share, beyond = (
+        min(phase.margin for phase in wa.feedback(scene, schedule, friction=0.1 * share, shape=0.0).phases)
+        for share in (held.share, held.share + 0.25)
+    )
+    assert beyond <= 0 < with_share
 
 
 def test_sets_that_a_law_does_not_know_are_refused(wholearm, tmp_path):

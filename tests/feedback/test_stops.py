@@ -6,9 +6,11 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax.execution import Amounts, run_trials
 from wholearm_jax.feedback import feedback
+from wholearm_jax.feedback.design import corner_scenes
 from wholearm_jax.feedback.path_table import tabulate_path
 from wholearm_jax.feedback.reference_motion import smooth_motions
 from wholearm_jax.feedback.stop_places import draw_shapes, stop_places
+from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop
 
 SHAPE = 5e-4
 
@@ -48,6 +50,30 @@ def test_stops_of_drawn_parts_lie_within_what_is_said(heptagon):
         alone = [stop_places(tables[: k + 1], [other[: k + 1]])[k] for other in others]
         outside = sum(other.before > place.before or other.beyond > place.beyond for other in alone)
         assert outside <= 2, (alone, place, table.s[-1])
+
+
+def test_the_push_at_a_stop_has_the_largest_margin_of_all_that_move_every_object(heptagon):
+    scene, phase, path = heptagon.scene, heptagon.scene.phases[0], heptagon.phases[0].traced
+    stops = [object_at_stop(scene, phase, path)]
+    for other in corner_scenes(scene, 0.2, 0.1)[1:4]:
+        stops.append(object_at_stop(other, phase, wa.trace(other)[0]))
+    torque, limit = np.array([0.3, -0.2]), np.asarray(scene.hand.torque_limit)
+    push, direction = choose_push(stops, torque, limit)
+
+    def margin(under):
+        return min(stop.statics.margin_under(under).margin for stop in stops)
+
+    found, tried = margin(torque + push * direction), 0
+    pull = stops[0].acceleration[3:]
+    ahead, across = pull / np.hypot(*pull), np.array([-pull[1], pull[0]]) / np.hypot(*pull)
+    for size in np.linspace(0.0, 60.0, 13):
+        for turn in np.linspace(-1.2, 1.2, 7):
+            under = torque + size * (ahead + np.tan(turn) * across) / np.hypot(*pull)
+            moves = min(stop.acceleration[0] + under @ stop.acceleration[3:] for stop in stops)
+            if moves >= 10.0 and (np.abs(under) <= limit).all():
+                tried += 1
+                assert margin(under) <= found + 1e-9
+    assert tried > 10
 
 
 def test_without_a_shape_the_reference_stops_at_the_end(heptagon):

@@ -109,11 +109,11 @@ def _design(optimum, uncertain: dict[str, float], as_json: bool):
         uncertain: half widths of friction, mass and vertices.
         as_json: whether standard output is for JSON alone.
     """
-    from wholearm_jax.feedback import feedback
+    from wholearm_jax.feedback import feedback, held_set
 
     friction, mass = (uncertain.get(name, 0.0) for name in ("friction", "mass"))
-    shape = uncertain.get("vertices")
-    controller = feedback(optimum.scene, optimum.torque, friction=friction, mass=mass, shape=shape)
+    objects = {"friction": friction, "mass": mass, "shape": uncertain.get("vertices")}
+    controller = feedback(optimum.scene, optimum.torque, **objects)
     for phase in controller.phases if not as_json else ():
         print(f"{phase.name}: closed loop, least force {phase.margin:.4g} N over all objects of the set")
     weakest = min(controller.phases, key=lambda phase: phase.margin)
@@ -121,9 +121,19 @@ def _design(optimum, uncertain: dict[str, float], as_json: bool):
         return controller
     note(
         f"no controller.json: in '{weakest.name}' a contact of some object of the set would open, least force "
-        f"{weakest.margin:.3g} N; a smaller set is written as --robust friction=10%"
+        f"{weakest.margin:.3g} N; {_what_holds(held_set(optimum.scene, optimum.torque, **objects), friction, mass)}"
     )
     return None
+
+
+def _what_holds(held, friction: float, mass: float) -> str:
+    """Say for which smaller set, and with which motors, there is a law."""
+    given = {"friction": held.share * friction, "mass": held.share * mass}
+    smaller = " ".join(f"--robust {name}={100 * width:.3g}%" for name, width in given.items() if width > 0)
+    said = f"a law holds {smaller}" if smaller else "no law holds a quarter of its friction and mass either"
+    if held.motors is None:
+        return said
+    return f"{said}; with torque limits {held.motors:g} times as large, one holds all of it"
 
 
 def _optimise_scene(name: str, scene, options: dict):

@@ -2,16 +2,19 @@
 
 from wholearm_jax.feedback.controller import Controller, PhaseLaw
 from wholearm_jax.feedback.design import feedback
+from wholearm_jax.feedback.held_set import HeldSet, held_set
 from wholearm_jax.feedback.law import LawState, begin, step
 from wholearm_jax.feedback.law_tables import law_tables, require_same_plan
 from wholearm_jax.feedback.planned_motion import planned_motion
 
 __all__ = [
     "Controller",
+    "HeldSet",
     "LawState",
     "PhaseLaw",
     "begin",
     "feedback",
+    "held_set",
     "law_tables",
     "planned_motion",
     "require_same_plan",

@@ -52,9 +52,31 @@ def choose_push(
     moves = np.min([stop.acceleration[0] + torques @ stop.acceleration[3:] for stop in stops], axis=0)
     within = np.all(np.abs(torques) <= limit, axis=1)
     decisive = within & (moves >= DECISIVE)
-    margin = np.full(len(torques), -np.inf)
-    for k in np.flatnonzero(decisive):
-        margin[k] = min(stop.statics.margin_under(torques[k]).margin for stop in stops)
-    chosen = int(np.argmax(np.where(decisive, margin, -np.inf) if decisive.any() else np.where(within, moves, -np.inf)))
+    candidates = np.flatnonzero(decisive)
+    if len(candidates):
+        chosen = int(candidates[_largest_margin(stops, torques[candidates])])
+    else:
+        chosen = int(np.argmax(np.where(within, moves, -np.inf)))
     push, turn = divmod(chosen, len(TURNS))
     return float(pushes[push]), directions[turn]
+
+
+def _largest_margin(stops: list[StopStatics], torques: Float[np.ndarray, "torques 2"]) -> int:
+    """Return which torque has the largest margin at rest, the least of all objects.
+
+    The nominal object's bounds it, so that few torques are asked of all objects, the one that ruled out the last first.
+    """
+    bounds = np.array([stops[0].statics.margin_under(torque).margin for torque in torques])
+    others, chosen, best = [stop.statics for stop in stops[1:]], 0, -np.inf
+    for k in np.argsort(-bounds, kind="stable"):
+        if bounds[k] <= best:
+            break
+        margin = bounds[k]
+        for j, statics in enumerate(others):
+            margin = min(margin, statics.margin_under(torques[k]).margin)
+            if margin <= best:
+                others.insert(0, others.pop(j))
+                break
+        else:
+            chosen, best = int(k), margin
+    return chosen
