@@ -73,11 +73,12 @@ def draw(found: dict) -> plt.Figure:
             low, high = np.array([row["interval_95"] for row in rows]).T
             at, error = np.arange(len(rows)) + 0.36 * (k - 0.5), np.maximum(np.stack([rate - low, high - rate]), 0)
             ax.bar(at, 100 * rate, 0.34, yerr=100 * error, color=COLOURS[k], label=f"{loop} loop", capsize=2)
-        ax.set_xticks(range(len(found)), list(found), rotation=20)
+        ax.set_xticks(range(len(found)), list(found), rotation=25, ha="right", fontsize=8)
         ax.set_title(label, fontsize=9)
         ax.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("executions that succeed [%]")
-    axes[-1].legend(frameon=False, fontsize=8)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     return figure
 
 
