@@ -29,8 +29,9 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(autouse=True, scope="session")
 def _programs_are_kept(request):
     """Workers share compiled programs, also with what they start as users do, and the next run finds them."""
-    if jax.config.values["jax_compilation_cache_dir"] is None:
-        jax.config.update("jax_compilation_cache_dir", str(request.config.cache.mkdir("programs") / "wholearm_jax"))
+    cache = getattr(request.config, "cache", None)  # None where pytest keeps none
+    if cache is not None and jax.config.values["jax_compilation_cache_dir"] is None:
+        jax.config.update("jax_compilation_cache_dir", str(cache.mkdir("programs") / "wholearm_jax"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
