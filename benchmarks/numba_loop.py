@@ -1,4 +1,4 @@
-r"""A hand-written loop over a wire's table: what simulating one phase costs without any framework, in numba.
+r"""A hand-written loop over a path's table: what simulating one phase costs without any framework, in numba.
 
     ds/du = w,    dw/du = T^2 (A0 + A3 tau1 + A4 tau2) + T A2 w + A1 w^2
 

@@ -87,6 +87,7 @@ def test_former_words_are_gone():
     found = identifiers()
     assert len(found) > 3000
     assert not {word: sorted(found[word]) for word in FORMER_WORDS if word in found}
+    assert not {name for name in found if {"wire", "wires"} & set(name.lower().split("_"))}
 
 
 def test_functions_and_files_can_be_read():

@@ -4,7 +4,7 @@ status that names the reason.
     python -m benchmarks.stability [--count 100000] [--seed 1] [--quick]
 
 The scenes come from `scenes`, the package's own steps from `programs`; what must hold is checked by
-`checks`, on mechanics written a second time in `tests.reference.mechanics`. Wires are traced at the default resolution.
+`checks`, on mechanics written a second time in `tests.reference.mechanics`. Paths are traced at the default resolution.
 What that cannot resolve goes on to a finer table, and what needs more steps gets them, as `wholearm_jax.trace` and
 `simulate` do for one scene. A tenth of the scenes runs again in single precision.
 """

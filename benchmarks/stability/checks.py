@@ -116,7 +116,7 @@ def relative(error, *terms):
 # --- along the path --------------------------------------------------------------------------------------------------
 
 
-def wire_residuals(model: Model, at) -> dict[str, np.ndarray]:
+def path_residuals(model: Model, at) -> dict[str, np.ndarray]:
     """Closure, tangents, accelerations and forces of a table, column by column, at places of the path.
 
     `at` holds `z`, `x = dz/ds` (object units), the `chart`, the table's `acceleration` (scenes, places, 5) and `force`
@@ -148,7 +148,7 @@ def wire_residuals(model: Model, at) -> dict[str, np.ndarray]:
     return found
 
 
-def wire_signs(model: Model, at) -> np.ndarray:
+def path_signs(model: Model, at) -> np.ndarray:
     """How far slips and joint speeds contradict the signs of their piece (0: nowhere)."""
     here = model.geometry(at["z"])
     size = np.sqrt(dot(at["x"], at["x"]))[..., None]

@@ -28,7 +28,7 @@ def simulate(found, scenes, which, paths, tables, level, stepped, final, limits)
     model = Model.of(some)
     units = checks.Units.of(model)
     found["violations"][rows] = 0
-    check_wire(found, rows, some, model, units, paths, tables, result, limits)
+    check_path(found, rows, some, model, units, paths, tables, result, limits)
     check_motion(found, rows, model, units, result, limits)
     check_rest(found, rows, some, model, units, result, limits)
     found["status"][rows], found["table_status"][rows] = result.status, tables.status
@@ -43,13 +43,13 @@ def simulate(found, scenes, which, paths, tables, level, stepped, final, limits)
     return rows[again & (not final)]
 
 
-def check_wire(found, rows, some, model, units, paths, tables, result, limits):
+def check_path(found, rows, some, model, units, paths, tables, result, limits):
     """The whole length of a path and its table."""
     along = units.remove(result.along)
-    for name, value in checks.wire_residuals(model, along).items():
+    for name, value in checks.path_residuals(model, along).items():
         found[name][rows] = value.max(1)
     found["seam"][rows] = result.seam
-    found["sign"][rows] = checks.wire_signs(model, along).max(1)
+    found["sign"][rows] = checks.path_signs(model, along).max(1)
     found["beyond"][rows] = checks.outside(model, along["z"]).max(1)
     links, stated = Links.of(some, model.size), some.flush_tolerance / model.size
     thick = (some.offset + some.back).max(1) > 0

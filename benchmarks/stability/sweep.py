@@ -65,7 +65,7 @@ def swept(scenes: Scenes, precision: Precision) -> dict[str, np.ndarray]:
 
 
 def traced(scenes, rows, level):
-    """Wires and tables of some scenes, batch by batch, as NumPy."""
+    """Paths and tables of some scenes, batch by batch, as NumPy."""
     program = tracer(Resolution(level.segments, level.panels, 8))
     for batch, real in batches(len(rows), level.lanes):
         some = rows[batch]

@@ -85,7 +85,7 @@ def test_margins_are_right_to_what_is_said_by_default(ensemble, schedule, checke
     assert np.any(quick.margin != checked.margin), "it is no test of another level"
 
 
-def test_scenes_with_the_same_wires_are_what_they_are_alone(scene, schedule):
+def test_scenes_with_the_same_paths_are_what_they_are_alone(scene, schedule):
     loose = make_ensemble(scene, {"friction": "10%", "mass": "5%"}, seed=SEED)
     assert loose.has_common_paths
     checked = wa.check(loose, schedule, count=2, arrival=ARRIVAL, tolerance=1e-10)
@@ -449,7 +449,7 @@ def test_an_object_waits_only_where_some_forces_hold_it(scene, schedule, ways):
     assert_as_alone(wa.check([scene], torque, arrival=ARRIVAL, tolerance=1e-10), scene, torque, 0)
 
 
-def test_scenes_that_share_their_geometry_share_their_wires(scene):
+def test_scenes_that_share_their_geometry_share_their_paths(scene):
     """All phases are traced once, whatever friction and mass: `vmap` would not give out one of them for all else."""
 
     def paths(friction, mass):

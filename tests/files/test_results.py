@@ -51,7 +51,7 @@ def numbers(row, names):
 # --- trajectories and summaries --------------------------------------------------------------------------------------
 
 
-def test_trajectory_ends_each_phase_where_its_wire_ends(pushed, tmp_path):
+def test_trajectory_ends_each_phase_where_its_path_ends(pushed, tmp_path):
     path = tmp_path / "trajectory.csv"
     write_trajectory(pushed, path, samples=11)
     assert path.read_text().splitlines()[0] == HEADER

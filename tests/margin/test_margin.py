@@ -100,7 +100,7 @@ def test_durations_that_are_one_are_kept_and_those_in_no_order_refused(heptagon)
         wa.optimise(slide, durations=(2.0, 0.5))
 
 
-def test_a_wire_that_ends_where_it_begins_is_none(heptagon):
+def test_a_path_that_ends_where_it_begins_is_none(heptagon):
     """The usual slip of a pen: the next phase told to go back through what the object has just come up against."""
     scene, torque = heptagon
     data = to_dict(scene)

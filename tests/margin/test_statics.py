@@ -205,7 +205,7 @@ def test_executed_on_free_bodies(optimised):
 
 
 @pytest.mark.parametrize("length", [-6e-15, 0.0, 6e-15])
-def test_an_object_is_held_where_its_wire_ends(optimised, length):
+def test_an_object_is_held_where_its_path_ends(optimised, length):
     """The path of a hold at the end of the phase before it has no length but rounding, of either sign."""
     pause = optimised.result.phases[1]
     dynamics = pause.traced.dynamics

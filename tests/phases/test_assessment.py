@@ -133,7 +133,7 @@ def test_impacts_that_are_refused(dynamics, tensile, speed, impulse, expected):
     assert judged(dynamics, moved(dynamics, S.OK), margin_result=score, impact=entered) == (expected or otherwise)
 
 
-def test_a_wire_that_cannot_be_traced_counts_before_all(dynamics):
+def test_a_path_that_cannot_be_traced_counts_before_all(dynamics):
     untraced = eqx.tree_at(lambda t: t.status, dynamics, jnp.asarray(int(S.NO_CONVERGENCE), dynamics.status.dtype))
     pulled = Impact(jnp.asarray(-1.0), -jnp.ones(4), jnp.asarray(1.0))
     assert judged(untraced, moved(dynamics, S.OK), margin_result=scored(0.4, 2), impact=pulled) == (

@@ -99,7 +99,7 @@ def slide(request):
     return request.param, traced, s, np.asarray(jax.jit(jax.vmap(configuration))(s))
 
 
-def test_wire(slide):
+def test_path(slide):
     """The whole path, from the start's projection to where the scene ends it."""
     _, _, _, z = slide
     np.testing.assert_allclose(z[:, 1], H / 2, atol=1e-11, rtol=0)

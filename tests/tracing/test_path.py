@@ -44,7 +44,7 @@ def test_starts_and_ends_touch(traced):
         assert abs(float(made)) <= 1e-10
 
 
-def test_every_node_lies_on_the_wire(traced):
+def test_every_node_lies_on_the_path(traced):
     _, _, paths, mechanics = traced
     for at, formation in zip(paths, mechanics, strict=True):
         left = jax.vmap(jax.vmap(lambda z, f=formation: gaps(f.contacts, z)))(at.path.nodes)
@@ -88,7 +88,7 @@ def changed(name, **phase):
 
 
 @pytest.mark.parametrize("beyond", [0.0, 2e-16, 1e-12, 1e-9])
-def test_a_wire_that_ends_at_a_kink_keeps_its_friction(beyond):
+def test_a_path_that_ends_at_a_kink_keeps_its_friction(beyond):
     """A piece that is too short to tell which way a contact slips has friction of the same size as the piece before."""
     scene, whole = ending_at_its_kink(beyond)
     dynamics = wa.trace(scene)[0].dynamics
@@ -105,7 +105,7 @@ def test_until_ends_a_phase_early():
     assert float(at.end[0]) == pytest.approx(-0.01, abs=1e-12)
 
 
-def test_the_other_way_along_the_wire():
+def test_the_other_way_along_the_path():
     ahead, back = wa.trace(changed("heptagon"))[0], wa.trace(changed("heptagon", toward="x+"))[0]
     panel, xi = locate_panel(ahead.dynamics, jnp.asarray(0), ahead.dynamics.breakpoints[0])
     start = float(evaluate(ahead.dynamics.configuration, panel, xi)[0])

@@ -60,7 +60,7 @@ def execute(
             Hardware,
             Tolerance,
             require_objects,
-            require_wires,
+            require_paths,
         )
         from wholearm_jax.execution import execute as rollout
     except ModuleNotFoundError as error:
@@ -81,7 +81,7 @@ def execute(
     if not as_json and law is None:
         print(f"predicted: {prediction.message}")
     try:
-        require_wires(prediction)
+        require_paths(prediction)
     except ValueError:  # without a path there is no end to arrive at; the prediction says why
         if as_json:
             print_json({"prediction": {"status": prediction.status.label, "message": prediction.message}})

@@ -9,7 +9,7 @@ from wholearm_jax.execution.executions import (
     clock,
     execute,
     motor_torques,
-    require_wires,
+    require_paths,
     start_of,
     touching_contacts_at,
 )
@@ -49,7 +49,7 @@ __all__ = [
     "push",
     "push_map",
     "require_objects",
-    "require_wires",
+    "require_paths",
     "rollout_in_parallel",
     "run_copies",
     "run_trials",

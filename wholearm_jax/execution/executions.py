@@ -173,7 +173,7 @@ def execute(
     """
     require_positive(timestep=timestep)
     scene = prediction.scene
-    require_wires(prediction)
+    require_paths(prediction)
     times, step = clock(scene, timestep)
     torques: Float[np.ndarray, "steps 2"] | Motor = motor_torques(prediction.torque, times, step)
     if controller is not None:
@@ -202,7 +202,7 @@ def execute(
     )
 
 
-def require_wires(prediction: Result) -> None:
+def require_paths(prediction: Result) -> None:
     """Raise ValueError where a plan has no end to compare with."""
     for phase in prediction.phases:
         if int(phase.traced.dynamics.status) != Status.OK:

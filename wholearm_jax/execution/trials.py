@@ -39,7 +39,7 @@ from wholearm_jax.execution.executions import (
     assess_execution,
     clock,
     motor_torques,
-    require_wires,
+    require_paths,
     rollout,
     start_of,
     target_of,
@@ -152,7 +152,7 @@ def run_trials(
     Raises ValueError as `run_copies` and `require_objects` do, and for a `count` that is not positive.
     """
     require_positive(count=count)
-    require_wires(prediction)
+    require_paths(prediction)
     require_objects(prediction.scene, amounts)
     scenes = _draw_scenes(prediction.scene, amounts, seed, count)
     displacements = _draw_displacements(prediction.scene, amounts, seed, count)
@@ -178,11 +178,11 @@ def run_copies(
     """Execute copies of a plan in `workers` processes (default: one for each processor).
 
     `callback` sees each as it is done, in their order. A `controller` measures and acts through `hardware`, whose noise
-    `seed` plus the copy's number draws. Raises ValueError as `require_wires` does, and for a `timestep` that is not
+    `seed` plus the copy's number draws. Raises ValueError as `require_paths` does, and for a `timestep` that is not
     positive.
     """
     require_positive(timestep=timestep)
-    require_wires(prediction)
+    require_paths(prediction)
     begins, step = clock(prediction.scene, timestep)
     drives: Iterator = itertools.repeat(motor_torques(prediction.torque, begins, step))
     if controller is not None:
