@@ -6,8 +6,8 @@ Parts, hands and goals are those of `planning.py`, turns by 45 to 90 degrees wit
 asked one goal after the other. The best plan that is found is optimised, each phase in a second, and executed at the
 default time step: open loop, and where that does not succeed, as where errors grow along a path, under the law of
 `wholearm optimise --feedback` for the largest range of friction that it holds (20, 10, 5 % or the nominal one), at
-1 kHz, 1 ms late, with encoders of 4096 counts and 1 % of torque noise. An execution
-succeeds within 0.5 mm and 0.01 rad of the predicted end, the last contacts closed and no link met that should not be.
+1 kHz, 1 ms late, with encoders of 4096 counts and 1 % of torque noise. An execution succeeds within 0.5 mm and
+0.01 rad of the predicted end, the last contacts closed and no link met that should not be.
 Prints and writes how many plans are optimised, how many executions succeed, and what became of the others.
 """
 
@@ -52,7 +52,7 @@ def design(scene: wa.Scene, schedule: wa.TorqueSchedule) -> tuple[float, wa.Cont
     """Design a law for the largest range of friction that it holds, of those tried."""
     for friction in FRICTION:
         law = wa.feedback(scene, schedule, friction=friction)
-        if min(phase.margin for phase in law.phases) > 0:
+        if law.margin > 0:
             break
     return friction, law
 

@@ -92,7 +92,7 @@ def execute(
     trials = _run_trials(prediction, perturb, amounts, seed=seed, **settings) if perturb else None
     more: dict[str, Any] = {"torque": str(torque)}
     if law is not None:
-        least = {"least_force": min(phase.margin for phase in law.phases)}
+        least = {"least_force": law.margin}
         more = {"prediction": least, "controller": str(controller), "hardware": hardware._asdict()}
     more |= {"pushes": [dict(one._asdict(), impulse=one.impulse.tolist()) for one in pushes]} if pushes else {}
     content = execution_summary(execution, trials, **more)

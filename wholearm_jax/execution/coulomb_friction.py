@@ -12,8 +12,8 @@ that touch, `G = J_t M^-1 J_t'`, `h` the time step and `v_t` the slips after it.
 leaves forces as they are where each contact sticks, `v_t = 0`, or has `|c_t| = mu c_n` against its slip. It is
 repeated, MuJoCo answering each time with `c_n` and the accelerations, until no force changes. Contacts that all stick
 converge whatever their number, because `G` over its rows' sums has no eigenvalue beyond 1; but slowly. So for each
-guess of which contacts press, stick and slide in which direction, the forces are once those with which it would be
-right: a linear system (`_forces_if`). One or two guesses are enough in nearly all steps.
+active set, which contacts press, stick or slide in which direction, the forces are once those that fit it: a linear
+system (`_active_set_forces`). One or two active sets are enough in nearly all steps.
 """
 
 # MuJoCo's names come from a compiled module, which type checkers cannot see into.
@@ -87,15 +87,15 @@ def _settled(
         mujoco.mj_fwdConstraint(bodies.model, data)
         most = touching.friction * data.efc_force[touching.address]
         speed = touching.slip @ (data.qvel + step * data.qacc)
-        wanted = np.minimum(np.maximum(ct - speed / touching.mobility, -most), most)
-        change = np.abs(wanted - ct)
+        projected = np.minimum(np.maximum(ct - speed / touching.mobility, -most), most)
+        change = np.abs(projected - ct)
         wrong = (touching.mobility * change).max()
         if change.max() <= EXACT * most.max():
-            return wanted, float(wrong)
-        yields, slides = _yielding(data), np.where(np.abs(wanted) < most, 0.0, np.sign(wanted))
-        guess = (yields.tobytes(), slides.tobytes())
-        ct = wanted if guess in tried else _forces_if(slides, yields, bodies, data, touching, ct)
-        tried.add(guess)
+            return projected, float(wrong)
+        yields, slides = _yielding(data), np.where(np.abs(projected) < most, 0.0, np.sign(projected))
+        active_set = (yields.tobytes(), slides.tobytes())
+        ct = projected if active_set in tried else _active_set_forces(slides, yields, bodies, data, touching, ct)
+        tried.add(active_set)
     return ct, float(wrong)
 
 
@@ -105,7 +105,7 @@ def _yielding(data) -> Bool[np.ndarray, "constraints"]:
     return np.where(limit > 0, np.abs(data.efc_force) < limit, data.efc_force > 0)
 
 
-def _forces_if(
+def _active_set_forces(
     slides: Float[np.ndarray, "touching"],
     yields: Bool[np.ndarray, "constraints"],
     bodies: MujocoModel,

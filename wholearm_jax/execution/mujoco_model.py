@@ -97,7 +97,8 @@ class MujocoModel:
     `pair[geom1, geom2]` is the row of `names`, or after them of `link_meetings`, that two shapes belong to (-1: none);
     `toward[row]` is 1 where MuJoCo's contact normal points into the object and -1 where it points out of it. Each row
     of `names` has its `link` and its `friction` coefficient; `acting` says which pairs act when, and
-    `mobility` is the diagonal of `M^-1`. `xml` is the model as MJCF, always with MuJoCo's friction.
+    `mobility` is the diagonal of `M^-1`. `xml` is the model as MJCF, always with MuJoCo's friction and without
+    `LINK_GIVE`, which MJCF cannot say.
     """
 
     model: mujoco.MjModel

@@ -89,6 +89,11 @@ class Controller:
     torque_limit: Float[np.ndarray, "2"]
 
     @property
+    def margin(self) -> float:
+        """The smallest margin of all phases [N]; negative: some object of the set cannot be held."""
+        return min(phase.margin for phase in self.phases)
+
+    @property
     def longest(self) -> float:
         """The longest time that the plan can take [s]."""
         return sum(phase.duration + self.patience for phase in self.phases)

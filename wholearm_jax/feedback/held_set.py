@@ -33,8 +33,7 @@ def held_set(
 
     def holds(share: float, motors: float) -> bool:
         hand = eqx.tree_at(lambda s: s.hand.torque_limit, scene, motors * scene.hand.torque_limit)
-        law = feedback(hand, schedule, friction=share * friction, mass=share * mass, shape=shape)
-        return min(phase.margin for phase in law.phases) > 0
+        return feedback(hand, schedule, friction=share * friction, mass=share * mass, shape=shape).margin > 0
 
     share = next((share for share in SHARES if holds(share, 1.0)), 0.0)
     return HeldSet(share, next((motors for motors in MOTORS if holds(1.0, motors)), None))
