@@ -10,7 +10,7 @@ from wholearm_jax.cli import app
 
 COMMANDS = (
     "scene box.dxf --on e1 --mass 0.2 --friction palm=0.5,finger1=0.1,finger2=0.1",
-    "plan box.toml --by phi=-90deg --hand-from length=0.10:0.11,joint=0.04:0.05 --count 1 --out plan",
+    "plan box.toml --by phi=-90deg --hand-from length=0.10:0.10,joint=0.045:0.045 --count 1 --out plan",
     "optimise plan/plan.toml --feedback --robust friction=10% --out law",
     "execute plan/plan.toml --controller law/controller.json --out execution",
 )

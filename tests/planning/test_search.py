@@ -98,6 +98,19 @@ def test_an_unreachable_goal_names_the_nearest_pose(part):
     assert found.nearest.ends[-1][0] > float(part.start[0])
 
 
+def test_a_start_at_which_links_overlap_says_which(part):
+    """Of fingers so long that they cross above the object, by shapely."""
+    hand = eqx.tree_at(lambda h: h.length, part.hand, jnp.full(2, 0.17))
+    z = resting_configuration(part.object, hand, 5, 0.02)
+    found = wa.plan(eqx.tree_at(lambda s: (s.hand, s.start), part, (hand, jnp.asarray(z))), by={"x": -0.01})
+    tips = [np.asarray(hand.joint[k]) + 0.17 * np.array([np.cos(z[3 + k]), np.sin(z[3 + k])]) for k in range(2)]
+    fingers = [LineString([np.asarray(hand.joint[k]), tips[k]]) for k in range(2)]
+    assert fingers[0].crosses(fingers[1])
+    assert not found.found
+    assert found.nodes == 0
+    assert found.reason.startswith("no plan: at the start finger1 and finger2 cross, ")
+
+
 def test_a_floor_for_the_margin_holds(part):
     assert not wa.plan(part, by={"phi": -0.35}, margin=5.0, max_phases=2).found
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from wholearm_jax.core import as_device_array, require_x64
 from wholearm_jax.model import ANGLE_COORDINATES, AWAY_NAMES, COORDINATES, Scene, feature_pair, rigid_body
-from wholearm_jax.phases import possible_hand_overs, trace
+from wholearm_jax.phases import describe_overlaps, possible_hand_overs, trace
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import Move, moves_from
 from wholearm_jax.planning.obstructions import explain_failure
@@ -128,6 +128,9 @@ def plan(
         rolling=rolling,
         regrasp_cost=regrasp_cost,
     )
+    overlaps = describe_overlaps(scene, as_device_array(start))
+    if overlaps:
+        return PlanningResult(start, search.goal, (), None, f"no plan: at the start {'; '.join(overlaps)}", 0, 0, ())
     _push(search, start, (), touching)
     out_of_time = _run(search, time_limit, max_nodes, callback)
     nearest, reason = None, ""
