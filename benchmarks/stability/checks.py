@@ -5,6 +5,7 @@ Every function takes batches with a leading axis of scenes. Residuals are relati
 largest term. Violations are counted by name; a scene may have several.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -163,6 +164,30 @@ def outside(model: Model, z) -> np.ndarray:
     low, high = model.limits()
     along = model.geometry(z).along
     return np.maximum(np.maximum(low[:, None] - along, along - high[:, None]).max(-1), 0.0)
+
+
+def holds_one_tip(model: Model, z, tolerance) -> np.ndarray:
+    """Whether two contacts hold a fingertip at one vertex, not a notch, where it slips off along either side (scenes).
+
+    A vertex on that finger and an edge of which it is an end, or both edges beside it.
+    """
+    along, (_, extent) = model.geometry(z[:, None]).along[:, 0], model.limits()
+    row, following = np.arange(len(z))[:, None], model.following()
+    after = following[row, model.feature]
+    at_end = np.where(along > extent - tolerance, after, -1)
+    corner = np.where(model.kind == 0, model.feature, np.where(along < tolerance, model.feature, at_end))
+    edge = model.vertices[row, following] - model.vertices
+    turn = dot(quarter(edge), edge[row, following])  # at the end of each edge
+    notch = np.zeros(edge.shape[:2], bool)
+    np.put_along_axis(notch, following, turn < 0, axis=1)
+    found = np.zeros(len(z), bool)
+    for i, j in itertools.combinations(range(model.kind.shape[1]), 2):
+        same = (model.link[:, i] == model.link[:, j]) & (corner[:, i] == corner[:, j]) & (corner[:, i] >= 0)
+        tip = (model.kind[:, i] == 1) | (model.kind[:, j] == 1)
+        both = (model.kind[:, i] == 1) & (model.kind[:, j] == 1)
+        held = ~model.tangential[:, i] & ~model.tangential[:, j]
+        found |= same & tip & held & ~(both & notch[row[:, 0], corner[:, i]])
+    return found
 
 
 def rests_on_a_link(model: Model, z, tolerance) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from tests.reference.mechanics import dot, quarter
 
 SIDES = (1.0, -1.0)
+SURFACE = 1e-6  # of a finger's length, below the palm's surface, from which on its tip is below and all of it counts
 
 
 class Links(NamedTuple):
@@ -105,7 +106,8 @@ def below(links, z):
         across = np.where(run[..., 0] == 0, 1e-300, run[..., 0])
         shares = np.clip((ends - start[..., :1]) / across[..., None], 0.0, 1.0)
         heights = start[..., 1:] + shares * run[..., 1:]
-        crossed = (np.ptp(shares, axis=-1) > 1e-9) & ((start + run)[..., 1] < 0)
+        is_below = (start + run)[..., 1] < -SURFACE * links.length[:, None, k]
+        crossed = (np.ptp(shares, axis=-1) > 1e-9) & is_below
         worst = np.maximum(worst, np.where(crossed, -heights.min(-1), 0.0))
         tips = rectangle[..., 1:3, :]
         beside = (tips[..., 0] > ends[..., :1]) & (tips[..., 0] < ends[..., 1:])

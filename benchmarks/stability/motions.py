@@ -70,7 +70,8 @@ def check_path(found, rows, some, model, units, paths, tables, result, limits):
     )
     flag(found, rows, "ok although links overlap", (result.status == checks.OK) & deep)
     until = some.until_coordinate, some.until_value / units.z[np.arange(len(rows)), some.until_coordinate]
-    real = checks.end_is_real(model, along["z"][:, -1], paths.end_reason, paths.end_contact, until, limits.place)
+    near = limits.place + stated  # what begins flush may stay as deep as it is
+    real = checks.end_is_real(model, along["z"][:, -1], paths.end_reason, paths.end_contact, until, near)
     met = meet(links, along["z"][:, -1:], limits.place)[:, 0]
     flag(found, rows, "end without a cause", ~np.where(paths.end_reason == checks.MET, met, real))
     first, x = along["z"][:, 0], along["x"][:, 0]

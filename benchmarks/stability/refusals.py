@@ -60,7 +60,8 @@ def refuse(found, scenes, some, paths, tables, status, which, limits):
     out = checks.outside(model, start[:, None])[:, 0]
     deep = np.maximum(model.depth(start[:, None]), model.depth_of_corners(start[:, None]))[:, 0]
     behind = model.crossing(start[:, None])[:, 0]
-    in_place = (out < limits.closure) & (deep < limits.closure) & ~behind
+    twice = checks.holds_one_tip(model, start, limits.place)
+    in_place = (out < limits.closure) & (deep < limits.closure) & ~behind & ~twice
     flag(found, rows, "refused although in place", (reason == MISPLACED) & in_place)
     flag(found, rows, "refused although touching", (reason == APART) & some.exact & (status != checks.LEFT))
     deep = np.maximum(overlap(links, start[:, None]), 0.0)[:, 0]

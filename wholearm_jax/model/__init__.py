@@ -50,6 +50,7 @@ from wholearm_jax.model.scene import (
     contact_formation,
     contact_name,
     feature_pair,
+    next_vertex,
     parse_contact,
     path_target,
     polygon,

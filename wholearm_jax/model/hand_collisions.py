@@ -206,5 +206,6 @@ def _depth_below_palm(hand: Hand, joint, along, length):
     cuts = (jnp.stack([hand.joint[1, 0], hand.joint[0, 0]]) - joint[0]) / span
     near, far = jnp.clip(cuts.min(), 0.0, length), jnp.clip(cuts.max(), 0.0, length)
     lowest = jnp.minimum(joint[1] + near * along[1], joint[1] + far * along[1])
-    is_below = (joint[1] + length * along[1] < 0) & (far - near > CORNER_TOL * length)
+    # A finger whose joint is below the surface comes out of it where its tip does: there rounding decides nothing.
+    is_below = (joint[1] + length * along[1] < -CORNER_TOL * length) & (far - near > CORNER_TOL * length)
     return jnp.where(is_below, -lowest, -jnp.inf)

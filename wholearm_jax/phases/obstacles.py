@@ -7,12 +7,14 @@ from jaxtyping import Array, Float
 from wholearm_jax.model import (
     LINK_OBSTACLES,
     LINKS,
+    VERTEX,
     ContactFormation,
     LinkMeeting,
     Phase,
     Scene,
     contact_candidates,
     contact_kinematics,
+    contact_name,
     contact_set,
     link_obstacles,
     link_overlaps,
@@ -85,7 +87,8 @@ _overlaps = jax.jit(link_overlaps)
 def describe_refused_start(scene: Scene, phase: Phase, z: Float[Array, "5"]) -> str | None:
     """Say why no path of a phase can begin at `z` (SI); None where nothing overlaps and contacts are on their features.
 
-    A fingertip at a vertex is named where two contacts hold it, or the finger would cut the vertex off.
+    A fingertip at a vertex is named where two contacts hold it, or the finger would cut the vertex off, and a vertex
+    where the object lies behind the link that it touches.
     """
     along, lower, upper, twice, inward = (np.asarray(a) for a in _formation_places(scene, phase.formation, z))
     beyond = np.maximum(lower - along, along - upper)
@@ -98,7 +101,21 @@ def describe_refused_start(scene: Scene, phase: Phase, z: Float[Array, "5"]) -> 
         for i, j in np.argwhere(np.triu(twice))
     ]
     corners += [f"{names[k]}: the finger comes from the object's side of that edge" for k in np.flatnonzero(inward)]
+    corners += _touched_from_behind(scene, phase.formation, z)
     return "; ".join((*describe_overlaps(scene, z), *misplaced, *corners)) or None
+
+
+def _touched_from_behind(scene: Scene, formation: ContactFormation, z: Float[Array, "5"]) -> list[str]:
+    """Say which vertices touch links behind which the object lies, with both its sides there."""
+    count, tolerance = int(scene.object.count), float(rigid_body(scene.object).flush_tolerance)
+    gap = np.asarray(_object_pairs(scene, z)[0].gap).reshape(5, -1)
+    rows = zip(*(np.asarray(a).tolist() for a in (formation.link, formation.kind, formation.feature)), strict=True)
+    found = {
+        f"{contact_name(link, kind, k)}: the object lies behind {LINKS[link]}": None
+        for link, kind, k in rows
+        if kind == VERTEX and gap[link, k - 1 if k else count - 1] + gap[link, (k + 1) % count] < -2 * tolerance
+    }
+    return [*found]
 
 
 @jax.jit

@@ -31,6 +31,7 @@ from wholearm_jax.model import (
     gap_velocity,
 )
 from wholearm_jax.tracing.corners import hold_same_tip
+from wholearm_jax.tracing.start_checks import lie_before_link
 
 COINCIDENT_FRACTION = 1e-7  # of a step, within which events count as met at the same place
 
@@ -99,11 +100,12 @@ def event_functions(mechanics: ScaledMechanics, target: PathTarget, z: Float[Arr
     """Gather the terminal events of a formation's path from `z` on."""
     pairs, held, links = mechanics.candidates, mechanics.contacts, mechanics.links
     until = target.until_coordinate >= 0
-    # A vertex that begins flush on a link, a little behind it, may stay as deep as it is.
+    # What begins flush on a link, a little behind it, may stay as deep as it is.
     at, at_held = contact_kinematics(pairs, z), contact_kinematics(held, z)
     depth = -at.gap
-    is_flush = (depth > eps_power(z, 5 / 8)) & (depth <= mechanics.flush_tolerance) & pairs.on_link
-    flush_depth = jnp.where(is_flush & ~mechanics.may_be_behind, depth, 0.0)
+    is_flush = (depth > eps_power(z, 5 / 8)) & (depth <= mechanics.flush_tolerance)
+    in_front = ~mechanics.may_be_behind | lie_before_link(mechanics, at.gap, mechanics.flush_tolerance)
+    flush_depth = jnp.where(is_flush & in_front, depth, 0.0)
     sense = jnp.where(target.until_value < z[target.until_coordinate], -1.0, 1.0)
     of_target = jnp.where(until, sense * target.until_value, 1.0)
     may_part = (jnp.abs(depth) < CORNER_TOL) & hold_same_tip(pairs, at, held, at_held).any(1)
@@ -167,14 +169,15 @@ def detect_events(events: EventFunctions, before: EventValues, after: EventValue
     parts = events.may_part & (jnp.abs(before.values) <= tolerance)
     through = (old >= -tolerance) & (new < -sense * tolerance) & ~parts
     slope = jnp.where(arriving > leaving, arriving - leaving, 1.0)
-    turns = (leaving < 0) & (arriving > 0) & (old > tolerance)
-    sinks = turns & (old - step * leaving**2 / (2 * slope) < 0)
+    turns = (leaving < 0) & (arriving > 0) & (old >= -tolerance) & ~parts
+    # What touches already has rates by rounding, too: it sinks where it comes below its tolerance.
+    sinks = turns & (old - step * leaving**2 / (2 * slope) < jnp.where(old > tolerance, 0.0, -tolerance))
     dips = sinks & (new > tolerance)
 
     def placed():
         """Most steps cross nothing: there all this is left out."""
         line = jnp.clip(old / jnp.where(through, old - new, 1.0), 0.0, 1.0)
-        bend = jnp.sqrt(jnp.where(sinks, leaving**2 - 2 * old * slope / step, 0.0))
+        bend = jnp.sqrt(jnp.where(sinks, leaving**2 - 2 * jnp.maximum(old, 0.0) * slope / step, 0.0))
         # What comes back is met on its way down.
         where = jnp.where(through & ~sinks, line, (-leaving - bend) / slope)
         low, high = step * leaving, step * arriving

@@ -19,6 +19,7 @@ from wholearm_jax.model import (
     constraint_jacobian,
     contact_kinematics,
     link_overlaps,
+    next_vertex,
 )
 from wholearm_jax.tracing.corners import hold_same_tip, run_into_object
 
@@ -26,9 +27,10 @@ from wholearm_jax.tracing.corners import hold_same_tip, run_into_object
 def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) -> Bool[Array, ""]:
     """Whether a configuration `z` is inadmissible as a path's start.
 
-    That is so where a contact lies beyond its feature, a vertex behind the palm, part of a link within the object, or a
-    convex object behind a finger on which one of its vertices slides, or where two contacts hold a fingertip at a
-    vertex, or the finger would cut that vertex off. Behind a finger whose tip touches an edge, vertices may lie.
+    That is so where a contact lies beyond its feature, a vertex behind the palm, part of a link within the object, the
+    object behind a link that one of its vertices touches, or a vertex of a convex object behind a finger on which
+    another one slides, or where two contacts hold a fingertip at a vertex, or the finger would cut that vertex off.
+    Behind a finger whose tip touches an edge, vertices may lie.
     """
     tolerance = eps_power(z, 5 / 8)
     flush_tolerance = jnp.maximum(tolerance, mechanics.flush_tolerance)
@@ -44,9 +46,12 @@ def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) ->
         & inside
         & (pairs.gap < -flush_tolerance)
     )
+    held = mechanics.exists & ~mechanics.may_terminate & mechanics.candidates.on_link
+    from_behind = held & inside & ~lie_before_link(mechanics, pairs.gap, flush_tolerance)
     return (
         jnp.any(beyond)
         | jnp.any(behind)
+        | jnp.any(from_behind)
         | jnp.any(hold_same_tip(mechanics.contacts, contacts, mechanics.contacts, contacts))
         | jnp.any(run_into_object(mechanics.contacts, contacts, z, flush_tolerance))
         | link_penetrates_object(mechanics, pairs, flush_tolerance)
@@ -56,6 +61,19 @@ def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) ->
 def links_overlap(mechanics: ScaledMechanics, z: Float[Array, "5"]) -> Bool[Array, ""]:
     """Whether links lie in one another at `z`, or a joint is beyond its range."""
     return jnp.any(link_overlaps(mechanics.hand, z[3:]) > eps_power(z, 5 / 8))
+
+
+def lie_before_link(
+    mechanics: ScaledMechanics, gap: Float[Array, "candidates"], tolerance: Float[Array, ""]
+) -> Bool[Array, "candidates"]:
+    """Whether the two sides of the object at a vertex lie, taken together, in front of a link's line.
+
+    `gap` is that of `mechanics.candidates`; only rows of vertices mean anything.
+    """
+    of_group, exists = (a.reshape(len(FEATURE_GROUPS), -1) for a in (gap, mechanics.exists))
+    vertex, count = jnp.arange(exists.shape[1]), exists[0].sum()
+    before, after = jnp.where(vertex > 0, vertex, count) - 1, next_vertex(count, vertex.shape[0])
+    return (of_group[:, before] + of_group[:, after] > -2 * tolerance).ravel()
 
 
 # Each link's two ends, and the vertices against that link: fingers from root to tip, the palm from left to right.
