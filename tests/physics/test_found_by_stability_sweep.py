@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.path import Path
+from shapely import LineString, Polygon
 from support import layered, steadiest_difference
 
 import wholearm_jax as wa
@@ -20,18 +21,20 @@ from wholearm_jax.margin import (
     best_quasistatic_torque_batch,
     minimum_margin,
 )
-from wholearm_jax.model.kinematics import contact_kinematics, gaps
+from wholearm_jax.model import link_overlaps
+from wholearm_jax.model.kinematics import FEATURE_GROUPS, contact_kinematics, gaps
 from wholearm_jax.model.mechanics import scaled_mechanics
 from wholearm_jax.model.scene import rigid_body
 from wholearm_jax.model.schedule import restrict_to_phase
-from wholearm_jax.phases.phase_ends import describe_end
+from wholearm_jax.phases.obstacles import describe_refused_start
+from wholearm_jax.phases.phase_ends import configuration, describe_end
 from wholearm_jax.phases.phase_tracing import trace_phase
 from wholearm_jax.phases.plan_simulation import simulate_phases
 from wholearm_jax.phases.sampling import sample_phase
 from wholearm_jax.simulation import IntegratorOptions, quintic_hermite, simulate_motion
 from wholearm_jax.tracing.events import EventValues, detect_events
 from wholearm_jax.tracing.path import Resolution
-from wholearm_jax.tracing.start_checks import link_penetrates_object
+from wholearm_jax.tracing.start_checks import lie_before_link, link_penetrates_object, violates_contact_limits
 
 
 def scene(vertices, contacts, toward, start, *, joint, length, offset=(0.0, 0.0)):
@@ -416,3 +419,87 @@ def test_a_motion_may_stop_and_go_on_often():
     assert len(phase.holds) == 12
     stops = [float(phase.outcome.motion.s[k]) for k in np.flatnonzero(phase.outcome.motion.at_rest)]
     assert np.diff(stops).min() > 1e-4, "each push moves it"
+
+
+def notched(flat, **phase):
+    """A part with a notch in its top, beside a finger; vertex 1 is `flat` [m] beyond the line through vertex 2."""
+    finger = {"length": 0.1, "inertia": 2e-3, "viscous": 0.02, "dry": 0.01, "torque_limit": 1.0, "range": [-3.2, 6.2]}
+    hand = {"finger1": finger | {"joint": [0.06, -0.02]}, "finger2": finger | {"joint": [-0.05, 0.0]}}
+    corners = [[0, 0], [0.06 + flat, 0], [0.06, 0.04], [0.03, 0.03], [0, 0.04]]
+    body = {"center_of_mass": [0.03, 0.02], "inertia": 1e-4, "mass": 0.2, "friction": 0.2}
+    return wa.parse(
+        {
+            "title": "notched",
+            "gravity": 9.81,
+            "hand": hand | {"fingers": "layered"},
+            "object": body | {"vertices": corners},
+            "start": {"x": 0.03, "y": 0.02, "phi": 0.0, "theta1": np.pi / 2, "theta2": np.arctan2(0.04, 0.05)},
+            "phase": [{"name": "p", "duration": 1.0} | phase],
+        }
+    )
+
+
+@pytest.mark.parametrize(("toward", "length"), [("theta1-", 0.0), ("theta1+", 1.6058)])
+def test_a_vertex_that_begins_flush_stops_a_part_with_a_notch(toward, length):
+    """10 nm behind the finger's line it does not count as behind the finger; the way on is measured by shapely."""
+    plan = notched(1e-8, contacts=["finger1:v2 rolling", "palm:v0", "finger2:v4"], toward=toward)
+    traced = wa.trace(plan)[0]
+    assert float(traced.dynamics.length) == pytest.approx(length, abs=1e-4)
+    corners = np.asarray(rigid_body(plan.object).vertices)[:5]
+    joint = np.asarray(plan.hand.joint)[0]
+    for s in np.linspace(0.0, length, 20):
+        z = np.asarray(configuration(traced.dynamics, jnp.asarray(0), traced.dynamics.breakpoints[0] + s))
+        (c, q), (c1, q1) = ((np.cos(a), np.sin(a)) for a in z[2:4])
+        outline = Polygon(corners @ np.array([[c, q], [-q, c]]) + z[:2])
+        finger = LineString([joint, joint + 0.1 * np.array([c1, q1])])
+        assert finger.intersection(outline.buffer(-1e-5)).length == 0
+
+
+def test_what_touches_and_sinks_is_met_at_once():
+    """A gap of 0 that dips to -0.01 and comes back within a step; one that dips below rounding alone does not count."""
+    step, tolerance = 0.2, 1e-10
+    old, leaving = jnp.zeros(2), jnp.array([-0.2, -1e-12])
+    before = EventValues(values=old, rates=leaving, along=old)
+    after = EventValues(values=old + 1e-3, rates=-leaving + 0.01, along=old)
+    unlimited = jnp.full(2, jnp.inf)
+    flags = {"two_sided": old > 1, "may_part": old > 1, "is_terminal": old == 0}
+    events = SimpleNamespace(lower=-unlimited, upper=unlimited, half_width=old, **flags)
+    crossed, where = detect_events(events, before, after, step, tolerance)
+    np.testing.assert_array_equal(crossed, [True, False])
+    assert 0 <= float(where[0]) < 1e-6
+
+
+@pytest.mark.parametrize(("phi", "behind"), [(0.0, True), (np.pi, False)])
+def test_a_link_is_not_touched_from_behind(phi, behind):
+    """A triangle that stands with a vertex on the back of finger 2, level in the air, and one that hangs below it."""
+    contacts = ["finger2:v0", "finger1:v1", "palm:v1", "palm:v2"]
+    plan = scene([[0.0, 0.0], [0.03, 0.05], [-0.03, 0.05]], contacts, "x-", (0,) * 5, joint=(0.2, -0.1), length=0.2)
+    apex = np.asarray(rigid_body(plan.object).vertices)[0]
+    turn = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]])
+    z = jnp.asarray([*(-turn @ apex), phi, np.pi / 2, 0.0])  # finger 2 lies along y = 0, its front below
+    fixed = mechanics(plan)
+    rows = contact_kinematics(fixed.candidates, z / fixed.configuration_unit).gap
+    in_front = lie_before_link(fixed, rows, jnp.asarray(1e-9)).reshape(len(FEATURE_GROUPS), -1)[2, 0]
+    assert bool(in_front) is not behind
+    if behind:
+        assert bool(violates_contact_limits(fixed, z / fixed.configuration_unit))
+    said = describe_refused_start(plan, plan.phases[0], z) or ""
+    assert ("finger2:v0: the object lies behind finger2" in said) is behind
+
+
+def test_rounding_does_not_put_a_finger_into_the_palm():
+    """A finger from below the palm's surface whose tip is level with it, to within rounding."""
+    joint, length = 0.02, 0.1
+    hand = scene(
+        [[0.0, 0.0], [0.03, 0.0], [0.0, 0.03]],
+        ["palm:v0", "palm:v1", "finger1:v1", "finger2:v2"],
+        "x-",
+        (0, 0, 0, 1, 1),
+        joint=(0.08, -0.08),
+        length=length,
+    ).hand
+    low = eqx.tree_at(lambda h: h.joint, hand, jnp.array([[0.08, -joint], [-0.08, 0.0]]))
+    level = np.pi - np.arcsin(joint / length)
+    for off, depth in ((1e-12, 0.0), (-1e-12, 0.0), (0.1, joint)):
+        found = float(link_overlaps(low, jnp.array([level + off, np.pi / 2]))[1])
+        assert found == pytest.approx(depth, abs=1e-9 if depth == 0 else length * np.sin(0.1))
