@@ -2,7 +2,7 @@
 
     python benchmarks/planning.py [--objects 2] [--seconds 5] [--quick]
 
-Objects are boxes, triangles, L shapes and random polygons, each at rest on its longest edge on three coplanar hands;
+Objects are boxes, triangles, L shapes and random polygons, each at rest on an edge on three coplanar hands;
 goals are slides by 20 and 40 mm, turns by 15 to 60 degrees, and both. Every goal is planned for with rolling contacts,
 without, and by a random search (a rapidly exploring random tree over the same moves, as in contact-mode-guided
 planning: X. Cheng, E. Huang, Y. Hou and M. T. Mason, 2021), each for the same time. Prints and writes the shares, the
@@ -23,6 +23,7 @@ from random_plans import random_object
 import wholearm_jax as wa
 from wholearm_jax.core import as_device_array
 from wholearm_jax.model import resting_configuration, rigid_body
+from wholearm_jax.phases import describe_overlaps
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import moves_from
 from wholearm_jax.planning.plans import Step, make_plan
@@ -55,7 +56,7 @@ def objects(rng: np.random.Generator, count: int) -> list[tuple[str, dict]]:
 
 
 def at_rest(shape: dict, joint: float, length: float) -> wa.Scene | None:
-    """Lay an object on its longest edge, fingers closed; None where it cannot lie or be held so."""
+    """Lay an object on the longest edge on which the fingers close on it without crossing; None: there is none."""
     fingers = {f"finger{k}": FINGER | {"joint": [x, 0.0], "length": length} for k, x in ((1, joint), (2, -joint))}
     start = dict.fromkeys(("x", "y", "phi", "theta1", "theta2"), 0.0)
     phase = {
@@ -73,7 +74,8 @@ def at_rest(shape: dict, joint: float, length: float) -> wa.Scene | None:
             z = resting_configuration(scene.object, scene.hand, int(edge), 0.01)
         except ValueError:
             continue
-        return eqx.tree_at(lambda s: (s.start, s.phases), scene, (as_device_array(z), ()))
+        if not describe_overlaps(scene, as_device_array(z)):
+            return eqx.tree_at(lambda s: (s.start, s.phases), scene, (as_device_array(z), ()))
     return None
 
 
