@@ -66,7 +66,7 @@ EXCESSES = ("sign", "beyond", "depth", "margin_excess", "tension_missed", "overl
 def blank(scenes: Scenes):
     """Records before anything is known."""
     n = len(scenes.count)
-    whole = ("status", "table_status", "reason", "violations", "level", "steps", "wire_end", "pieces")
+    whole = ("status", "table_status", "reason", "violations", "level", "steps", "path_end", "pieces")
     real = ("margin", "scale", "condition", "table_error", "length", "travel", "end_share", *RESIDUALS, *EXCESSES)
     found = {name: np.zeros(n, int) for name in whole} | {name: np.full(n, np.nan) for name in real}
     found |= {"torque": np.zeros((n, *scenes.noise.shape[1:])), "moved": np.zeros(n, bool)}

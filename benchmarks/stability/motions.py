@@ -38,7 +38,7 @@ def simulate(found, scenes, which, paths, tables, level, stepped, final, limits)
     found["moved"][rows] = result.moved
     found["torque"][rows] = result.torque.values
     found["steps"][rows], found["end_share"][rows] = result.count, result.phase_time
-    found["wire_end"][rows], found["pieces"][rows] = paths.end_reason, tables.count
+    found["path_end"][rows], found["pieces"][rows] = paths.end_reason, tables.count
     again = (result.status == checks.MAX_STEPS) | (found["energy"][rows] > limits.energy)
     return rows[again & (not final)]
 

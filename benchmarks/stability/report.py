@@ -94,7 +94,7 @@ def compared(double, single) -> dict:
         "same_table_status": float(np.mean(same["table_status"] == single["table_status"])),
         "same_status": float(np.mean(same["status"] == single["status"])),
         "margin_error_of_largest_force": quantiles(error),
-        "wire_length_error": quantiles(length),
+        "path_length_error": quantiles(length),
         "moved_in_both": int(both.sum()),
     }
 

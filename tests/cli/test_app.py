@@ -258,7 +258,7 @@ def test_plan_that_fails(wholearm, zero, tmp_path):
     assert [p["bound"] for p in content["phases"]] == pytest.approx([0.966, 0.835], abs=1e-3)
 
 
-def test_wire_that_cannot_be_followed(wholearm, zero, scene_file, tmp_path):
+def test_path_that_cannot_be_followed(wholearm, zero, scene_file, tmp_path):
     path = scene_file(lambda data: data["phase"][0].update(toward="phi+"))  # the object slides without turning
     code, printed, err = wholearm("simulate", path, "--torque", zero, "--out", tmp_path / "out")
     assert code == 1
@@ -277,7 +277,7 @@ def test_torques_beyond_a_limit_are_noted(wholearm, scene_file, tmp_path):
     assert err == f"wholearm: note: {torque}: |tau2| is 0.4 N m at t = 0.5 s, beyond the limit of 0.25 N m\n"
 
 
-def test_an_until_that_is_not_on_the_wire_is_noted(wholearm, zero, scene_file):
+def test_an_until_that_is_not_on_the_path_is_noted(wholearm, zero, scene_file):
     path = scene_file(lambda data: data["phase"][0].update(until={"x": 5.0}))
     _, _, err = wholearm("simulate", path, "--torque", zero)
     assert err.startswith(f"wholearm: note: {path}: phase[0].until: x = 5 is not on its path, which leads from ")

@@ -34,7 +34,7 @@ def early():
     return result, taken
 
 
-def test_who_is_caught_early_rests_where_the_wire_ends(early):
+def test_who_is_caught_early_rests_where_the_path_ends(early):
     result, taken = early
     (course,) = wa.trajectory(result, SAMPLES)
     moves, rests = course.time < taken - 1e-6, course.time > taken + 1e-6

@@ -86,7 +86,7 @@ def test_modes_and_differences_agree_along_random_directions(case):
 
 
 @pytest.mark.parametrize("beyond", [1e-14, 2e-14, 1e-12])
-def test_a_margin_where_a_wire_ends_beside_a_kink_has_its_derivative(beyond):
+def test_a_margin_where_a_path_ends_beside_a_kink_has_its_derivative(beyond):
     """Forces at the path's end do not depend on how long the phase might have gone on, however near to it a slip
     reverses: there is no piece in which forces, and the place of the least, would vary by rounding alone."""
     scene, _ = ending_at_its_kink(beyond)

@@ -74,7 +74,7 @@ def turning():
     )
 
 
-def test_a_wire_may_turn_far():
+def test_a_path_may_turn_far():
     """Charts follow each other: closure holds on both sides, `z` and `z_dot` are continuous where they meet."""
     at = wa.trace(turning())[0]
     dynamics, path, formation = at.dynamics, at.path, mechanics(turning())

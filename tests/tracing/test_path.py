@@ -51,7 +51,7 @@ def test_every_node_lies_on_the_path(traced):
         assert float(jnp.abs(left).max()) <= 1e-13
 
 
-def test_the_table_holds_the_wire_between_its_nodes(traced):
+def test_the_table_holds_the_path_between_its_nodes(traced):
     _, _, paths, mechanics = traced
     for at, formation in zip(paths, mechanics, strict=True):
         dynamics = at.dynamics
@@ -139,7 +139,7 @@ def test_statuses_name_what_happened():
     assert early.label in phase.message
 
 
-def test_a_wire_passes_the_turning_point_of_theta1():
+def test_a_path_passes_the_turning_point_of_theta1():
     data = to_dict(layered("heptagon"))
     contacts = ["palm:v0", "finger1:v3", "finger2:v5", "finger2:v6"]
     data["phase"] = [{"name": "turn", "contacts": contacts, "toward": "phi-", "duration": 1.0}]
@@ -245,7 +245,7 @@ def traced_with(scene, phase, panels):
 @pytest.mark.parametrize(
     ("lengths", "panels"), [([2.0, 0.01], [3, 1]), ([0.01, 2.0], [1, 3]), ([0.01, 2.0, 0.01], [1, 2, 1]), ([1.0], [4])]
 )
-def test_panels_go_where_the_wire_is_long(lengths, panels):
+def test_panels_go_where_the_path_is_long(lengths, panels):
     """At least one to each piece that is used; what rounding leaves over goes to the longest."""
     segments, count = 4, len(lengths)
     breaks = jnp.pad(jnp.cumsum(jnp.asarray([0.0, *lengths])), (0, segments - count), mode="edge")
