@@ -17,8 +17,6 @@ from wholearm_jax.tracing import PathEnd
 
 IDLE_ROUNDING = 1e-9  # share of the torque limit by which an idle torque may exceed dry friction
 STANDING_TOL = 1e-6  # [m] and [rad], within which the object stays where it is
-NO_TURN = 1e-5  # [rad], below which a finger has only left an overlap with what it touched
-BEHIND = ", which the start puts a little behind the finger: open it by as much, or begin with a phase that touches it"
 
 
 class Defect(NamedTuple):
@@ -66,7 +64,7 @@ def _find_path_defect(scene: Scene, phase: Phase, traced: TracedPhase) -> tuple[
         return Status.OBSTACLE, end
     made = int(traced.path.end_reason) == PathEnd.CONTACT_MADE
     if made and phase.regrasp in AWAY_NAMES:
-        return Status.OBSTACLE, f"{end} before the finger is away{BEHIND if moved[joint] < NO_TURN else ''}"
+        return Status.OBSTACLE, f"{end} before the finger is away"
     if made and end != f"{phase.regrasp} is made":
         return Status.OBSTACLE, f"{end} before {phase.regrasp}"
     return None
