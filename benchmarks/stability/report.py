@@ -22,7 +22,7 @@ NAMES = {
 }
 
 
-def summary(found) -> dict:
+def summary(found, limits) -> dict:
     """Counts and quantiles of one sweep."""
     traced = found["table_status"] == 0
     wrong = found["violations"]
@@ -38,7 +38,7 @@ def summary(found) -> dict:
             name: named(found["status"][found["layered"] == kind], STATUSES)
             for name, kind in (("layered", True), ("coplanar", False))
         },
-        "ok_with_thickness_in_object": int(((found["status"] == 0) & (found["thickness"] > DOUBLE.overlap)).sum()),
+        "ok_with_thickness_in_object": int(((found["status"] == 0) & (found["thickness"] > limits.overlap)).sum()),
         "reason_of_refusal": named(found["reason"][~traced], REASONS),
         "violations": {name: int((wrong >> bit & 1).sum()) for bit, name in enumerate(VIOLATIONS)},
         "scenes_with_violations": int((wrong != 0).sum()),
@@ -104,8 +104,8 @@ def report(double, single, seed, seconds, *, keep):
     result = {
         "seed": seed,
         "seconds": round(seconds),
-        "float64": summary(double),
-        "float32": summary(single) | {"against_float64": compared(double, single)},
+        "float64": summary(double, DOUBLE),
+        "float32": summary(single, SINGLE) | {"against_float64": compared(double, single)},
         "limits": {"float64": DOUBLE._asdict(), "float32": SINGLE._asdict()},
         "quantiles": QUANTILES,
     }
