@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wholearm_jax.model import (
+    FEATURE_GROUPS,
     LINK_OBSTACLES,
     LINKS,
     VERTEX,
@@ -19,8 +20,9 @@ from wholearm_jax.model import (
     link_obstacles,
     link_overlaps,
     rigid_body,
+    scaled_mechanics,
 )
-from wholearm_jax.tracing import hold_same_tip, run_into_object
+from wholearm_jax.tracing import hold_same_tip, lie_before_link, run_into_object
 
 STRETCH_PLACES = 17  # of a link's stretch in the object, at which its depth is looked at
 LEVEL_ANGLE = 1e-9  # [rad], within which a finger is level with the palm
@@ -107,15 +109,21 @@ def describe_refused_start(scene: Scene, phase: Phase, z: Float[Array, "5"]) -> 
 
 def _touched_from_behind(scene: Scene, formation: ContactFormation, z: Float[Array, "5"]) -> list[str]:
     """Say which vertices touch links behind which the object lies, with both its sides there."""
-    count, tolerance = int(scene.object.count), float(rigid_body(scene.object).flush_tolerance)
-    gap = np.asarray(_object_pairs(scene, z)[0].gap).reshape(5, -1)
+    in_front = np.asarray(_vertices_in_front(scene, formation, z)).reshape(len(FEATURE_GROUPS), -1)
     rows = zip(*(np.asarray(a).tolist() for a in (formation.link, formation.kind, formation.feature)), strict=True)
     found = {
         f"{contact_name(link, kind, k)}: the object lies behind {LINKS[link]}": None
         for link, kind, k in rows
-        if kind == VERTEX and gap[link, k - 1 if k else count - 1] + gap[link, (k + 1) % count] < -2 * tolerance
+        if kind == VERTEX and not in_front[FEATURE_GROUPS.index((link, kind)), k]
     }
     return [*found]
+
+
+@jax.jit
+def _vertices_in_front(scene: Scene, formation: ContactFormation, z):
+    mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, formation)
+    gap = contact_kinematics(mechanics.candidates, z / mechanics.configuration_unit).gap
+    return lie_before_link(mechanics, gap, mechanics.flush_tolerance)
 
 
 @jax.jit

@@ -3,4 +3,5 @@
 from wholearm_jax.tracing.corners import hold_same_tip, run_into_object
 from wholearm_jax.tracing.path import ContactPath, PathEnd, Resolution, chebyshev_points, placeholder_path
 from wholearm_jax.tracing.path_root import path_derivatives, solve_on_path
+from wholearm_jax.tracing.start_checks import lie_before_link
 from wholearm_jax.tracing.trace import trace_path
