@@ -12,8 +12,7 @@ from wholearm_jax.model.kinematics import (
     constraint_velocity,
     constraints,
     contact_kinematics,
-    feature_velocity,
-    gap_velocity,
+    contact_velocity,
     slip_velocity,
     tangential_jacobian,
 )
@@ -59,8 +58,9 @@ def test_rates_are_derivatives_of_gaps_and_places(mechanics, seed):
         _, (gap, along) = jax.jvp(
             lambda z, s=several: (contact_kinematics(s, z).gap, contact_kinematics(s, z).along), (z,), (x,)
         )
-        np.testing.assert_allclose(gap_velocity(several, z, x), gap, **NEAR)
-        np.testing.assert_allclose(feature_velocity(several, z, x), along, **NEAR)
+        np.testing.assert_allclose(contact_velocity(several, z, x, 1.0, 0.0), gap, **NEAR)
+        np.testing.assert_allclose(contact_velocity(several, z, x, 0.0, 1.0), along, **NEAR)
+        np.testing.assert_allclose(contact_velocity(several, z, x, 2.0, -3.0), 2 * gap - 3 * along, **NEAR)
 
 
 @pytest.mark.parametrize("seed", [2, 3])

@@ -244,16 +244,22 @@ def tangential_jacobian(contacts: ContactSet, z: Float[Array, "5"]) -> Float[Arr
     return _jacobian_along(contacts, at, _rotate_minus_90(at.normal))
 
 
-def gap_velocity(contacts: ContactSet, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "contacts"]:
-    """How fast gaps open where `z` moves at the rate `x`: `G_n x`, without the rows."""
-    at = contact_kinematics(contacts, z)
-    return _velocity_along(contacts, at, at.normal, x)
+@jax.jit
+def contact_velocity(
+    contacts: ContactSet,
+    z: Float[Array, "5"],
+    x: Float[Array, "5"],
+    gap: float | Float[Array, "contacts"],
+    along: float | Float[Array, "contacts"],
+) -> Float[Array, "contacts"]:
+    """How fast `gap C_n + along a` changes where `z` moves at the rate `x`, `a` being places along features.
 
-
-def feature_velocity(contacts: ContactSet, z: Float[Array, "5"], x: Float[Array, "5"]) -> Float[Array, "contacts"]:
-    """How fast places move `along` their features where `z` moves at the rate `x`."""
+    Both are velocities in a direction, so that a weighted sum of the directions, (`gap`, `along`), gives the sum.
+    """
     at = contact_kinematics(contacts, z)
-    return _feature_sign(contacts) * _velocity_along(contacts, at, _rotate_minus_90(at.normal), x)
+    (nx, ny), (tx, ty) = at.normal, _rotate_minus_90(at.normal)
+    along = along * _feature_sign(contacts)
+    return _velocity_along(contacts, at, (gap * nx + along * tx, gap * ny + along * ty), x)
 
 
 @jax.jit

@@ -27,8 +27,7 @@ from wholearm_jax.model import (
     PathTarget,
     ScaledMechanics,
     contact_kinematics,
-    feature_velocity,
-    gap_velocity,
+    contact_velocity,
 )
 from wholearm_jax.tracing.corners import hold_same_tip
 from wholearm_jax.tracing.start_checks import lie_before_link
@@ -72,8 +71,7 @@ class EventFunctions(NamedTuple):
         here, (first, second) = contact_kinematics(self.contacts, z), self.joint_angle
         return EventValues(
             values=self._values(here, z),
-            rates=self.gap * gap_velocity(self.contacts, z, slope)
-            + self.along * feature_velocity(self.contacts, z, slope)
+            rates=contact_velocity(self.contacts, z, slope, self.gap, self.along)
             + self.coordinate_weight * slope[self.coordinate]
             + first * slope[3]
             + second * slope[4],
