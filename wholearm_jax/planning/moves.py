@@ -16,6 +16,7 @@ from wholearm_jax.margin import best_quasistatic_torque
 from wholearm_jax.model import (
     AWAY_NAMES,
     ContactFormation,
+    PathTarget,
     Scene,
     alike_formations,
     contact_formation,
@@ -96,9 +97,15 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count())
 
 
+# In NumPy: passing its arrays to a compiled program takes a tenth of the time of moving each to a device.
 @functools.lru_cache(maxsize=4096)
 def _formation(contacts: tuple[str, ...]) -> ContactFormation:
-    return contact_formation(contacts)
+    return jax.tree.map(np.asarray, contact_formation(contacts))
+
+
+@functools.cache
+def _target(toward: str) -> PathTarget:
+    return jax.tree.map(np.asarray, path_target(toward))
 
 
 def _trace(scene: Scene, z, regrasps: bool, chosen) -> _Paths:
@@ -108,11 +115,8 @@ def _trace(scene: Scene, z, regrasps: bool, chosen) -> _Paths:
     if regrasps:  # one program, whether or not a finger is away in one of them
         every = alike_formations([*every, _formation(AWAY_NAMES[:1])])[:-1]
     formations = jax.tree.map(lambda *rows: np.stack(rows), *every)
-    targets = [path_target(toward) for _, toward in chosen]
-    stacked = jax.tree.map(lambda *rows: np.stack(rows), *targets)
-    as_arrays = functools.partial(jax.tree.map, jnp.asarray)
-    body = rigid_body(scene.object)
-    paths = _trace_moves(body, scene.hand, scene.gravity, as_arrays(formations), as_arrays(stacked), jnp.asarray(z))
+    targets = jax.tree.map(lambda *rows: np.stack(rows), *(_target(toward) for _, toward in chosen))
+    paths = _trace_moves(rigid_body(scene.object), scene.hand, scene.gravity, formations, targets, np.asarray(z))
     return jax.device_get(paths)
 
 
