@@ -13,6 +13,7 @@ RUNS = {  # what each runs, after `import NAME as module`
     "batch": "module.COUNTS = (8, 8); run('--quick')",
     "cold_start": "run('--quick')",
     "collocation": "run('heptagon', '--knots', '8')",
+    "cost_against": "run('HEAD', '--turns', '1')",
     "exhaustive_planning": "run('--quick')",
     "execution": "module.SCENES, module.STEPS = ('heptagon',), (1.6e-3, 8e-4); run('--quick')",
     "feedback": "module.SETS = dict([*module.SETS.items()][:1]); run('--quick', '--scenes', 'heptagon')",
