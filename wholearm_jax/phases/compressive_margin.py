@@ -83,8 +83,14 @@ def _slope(inputs, tangents, *, options: IntegratorOptions, resolution: Resoluti
         return eqx.filter_jvp(partial(_margin_in_programs, options=options, resolution=resolution), inputs, tangents)
     with eval_context():  # of numbers, as outside of the derivative: programs are shared
         value, gradient = margin_and_gradient(inputs, tangents, options, resolution)
-    along = jax.tree.map(lambda slope, tangent: (slope * tangent).sum(), gradient, tangents)
-    return value, sum(jax.tree.leaves(along))
+    return value, _sum_of_products(jax.tree.leaves(gradient), jax.tree.leaves(tangents))
+
+
+@jax.jit
+def _sum_of_products(gradient: list[Array], tangents: list[Array]) -> Float[Array, ""]:
+    """Return the slope along `tangents`: one program for all leaves, and one for its transpose."""
+    parts = [(slope * tangent).sum() for slope, tangent in zip(gradient, tangents, strict=True)]
+    return jnp.stack(parts).sum()
 
 
 def _coarsen(options: IntegratorOptions) -> IntegratorOptions:
