@@ -1,13 +1,15 @@
 """What a new process costs: from its start to the first result, with nothing compiled before and with programs kept.
 
-    python benchmarks/cold_start.py [--repeats N]
+    python benchmarks/cold_start.py [--repeats N] [--gradient]
 
 Each run is a process of its own, as a user starts it: `first` is when it prints its first result, `exit` when files and
 figures are written, too. With an empty cache folder everything is compiled; the second run finds the first one's
 programs there. `apart` splits one more process of each kind by what JAX itself reports:
 importing, tracing Python into programs and lowering them (threads overlap, so that parts may sum to more than the
 whole), compiling, reading kept programs, and the rest (figures, files, the computation). `plain` leaves the choice of
-emitters to XLA, and is otherwise compiled as by the command line.
+emitters to XLA, and is otherwise compiled as by the command line. Beside the commands stands a first gradient in
+Python, `equinox.filter_grad(wa.margin)` of the heptagon's plan with respect to its scene; `--gradient` measures that
+alone, and leaves the other results as they are kept.
 """
 
 import argparse
@@ -61,6 +63,18 @@ spent["whole"] = time.perf_counter() - begun
 print(json.dumps(spent))
 """
 
+GRADIENT = """
+import sys
+from pathlib import Path
+import equinox as eqx
+import wholearm_jax as wa
+from wholearm_jax.core import keep_compiled
+keep_compiled(Path(sys.argv[1]))
+wa.configure()
+slope = eqx.filter_grad(wa.margin)(wa.load(Path(sys.argv[2])), wa.read_torque(sys.argv[3]))
+print(float(slope.hand.length.sum()))
+"""
+
 
 def environment(cache: Path, flags: str = "") -> dict[str, str]:
     """A user's environment: the command line's own cache, in a folder of its own."""
@@ -109,6 +123,25 @@ def measured(name: str, arguments, repeats: int, torque: Path) -> dict:
     return {"seconds": medians, "runs": runs, "apart": parts}
 
 
+def first_gradient(repeats: int, torque: Path) -> dict[str, dict[str, float]]:
+    """Wall times [s] from a process's start to the gradient that it prints: nothing compiled, then programs kept."""
+    times: dict[str, list[float]] = {"cold": [], "kept": []}
+    with tempfile.TemporaryDirectory() as folder:
+        for k in range(repeats):
+            given = Path(folder, f"cache{k}"), layered_file("heptagon"), torque
+            command = [sys.executable, "-u", "-c", GRADIENT, *map(str, given)]
+            for kind in times:
+                begun = time.perf_counter()
+                with subprocess.Popen(command, env=environment(Path(folder)), stdout=subprocess.PIPE) as process:
+                    printed = process.stdout.readline()
+                    times[kind].append(time.perf_counter() - begun)
+                if not printed:
+                    raise RuntimeError("no gradient was printed")
+    seconds = {kind: statistics.median(several) for kind, several in times.items()}
+    print(f"first gradient: {seconds['cold']:.1f} s, programs kept {seconds['kept']:.1f} s", flush=True)
+    return {"seconds": seconds, "runs": times}
+
+
 def draw(found: dict, path: Path) -> None:
     """Bars: the parts of every process."""
     plt.rcParams |= {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none"}
@@ -146,10 +179,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--quick", action="store_true", help="`simulate` alone, once; saves nothing")
+    parser.add_argument("--gradient", action="store_true", help="the first gradient alone; other results stay")
     given = parser.parse_args()
+    knots = Path(__file__).parent / "data" / "heptagon_knots.csv"
+    if given.gradient:
+        kept = json.loads((measure.RESULTS / "cold_start.json").read_text())
+        measure.save("cold_start", kept | {"gradient": first_gradient(given.repeats, knots)})
+        return
     with tempfile.TemporaryDirectory() as folder:
         if given.quick:
-            torque = Path(__file__).parent / "data" / "heptagon_knots.csv"
+            torque = knots
             command = (*COMMANDS["simulate"], "--torque", str(torque))
             print("cold", run(command, Path(folder, "cache"), Path(folder, "out")))
             print("kept", apart(command, Path(folder, "cache"), Path(folder, "out")))
@@ -160,7 +199,7 @@ def main() -> None:
         for name, command in COMMANDS.items():
             found[name] = measured(name, command, given.repeats, torque)
             tabulate(name, found[name])
-    path = measure.save("cold_start", found)
+    path = measure.save("cold_start", found | {"gradient": first_gradient(given.repeats, knots)})
     draw(found, path.with_suffix(".svg"))
 
 

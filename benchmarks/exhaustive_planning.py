@@ -18,7 +18,7 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 from measure import RESULTS, save
-from planning import GOALS, HANDS, at_rest, objects
+from planning import GOALS, HANDS, at_rest, first_crossing, objects
 
 import wholearm_jax as wa
 from wholearm_jax.core import as_device_array
@@ -81,12 +81,9 @@ def _keep_ways(ways: dict[tuple, Node], node: Node, move: Move, goal: Goal) -> N
     last = len(move.places) - 1
     ends = [(None, move.places[last], lowest[last])]
     for name, value in goal.values.items():
-        off = move.places[:, COORDINATES.index(name)] - value
-        crossed = np.flatnonzero((off[:-1] != 0) & (off[:-1] * off[1:] <= 0))
-        if len(crossed):
-            k = crossed[0]
-            share = off[k] / (off[k] - off[k + 1])
-            ends.append(((name, value), move.places[k] + share * (move.places[k + 1] - move.places[k]), lowest[k + 1]))
+        passed = first_crossing(move.places, name, value)
+        if passed is not None:
+            ends.append(((name, value), passed[1], lowest[passed[0] + 1]))
     for until, z, margin in ends:
         if margin > 0 and goal.is_reached(z):
             steps = (*node.steps, Step(move.contacts, move.toward, until, z, float(margin)))

@@ -22,7 +22,7 @@ from random_plans import random_object
 
 import wholearm_jax as wa
 from wholearm_jax.core import as_device_array
-from wholearm_jax.model import resting_configuration, rigid_body
+from wholearm_jax.model import COORDINATES, resting_configuration, rigid_body
 from wholearm_jax.phases import describe_overlaps
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import moves_from
@@ -79,6 +79,19 @@ def at_rest(shape: dict, joint: float, length: float) -> wa.Scene | None:
     return None
 
 
+def first_crossing(places: np.ndarray, name: str, value: float) -> tuple[int, np.ndarray] | None:
+    """Where along a path a coordinate first has a value: in which interval, and the place; None: it has not.
+
+    A path that begins with that value has it only once it returns.
+    """
+    off = places[:, COORDINATES.index(name)] - value
+    crossed = np.flatnonzero((off[:-1] != 0) & (off[:-1] * off[1:] <= 0))
+    if not len(crossed):
+        return None
+    k = int(crossed[0])
+    return k, places[k] + off[k] / (off[k] - off[k + 1]) * (places[k + 1] - places[k])
+
+
 def random_tree(scene: wa.Scene, by: dict, seconds: float, seed: int, max_phases: int = 5):
     """Grow a random tree over the planner's moves for so many seconds; the best plan that it comes upon, or None."""
     rng, start = np.random.default_rng(seed), np.asarray(scene.start)
@@ -88,7 +101,7 @@ def random_tree(scene: wa.Scene, by: dict, seconds: float, seed: int, max_phases
     best, end = None, time.monotonic() + seconds
     target_of_goal = start.copy()
     for name, value in goal.values.items():
-        target_of_goal[("x", "y", "phi").index(name)] = value
+        target_of_goal[COORDINATES.index(name)] = value
     while time.monotonic() < end:
         target = target_of_goal[[0, 2]] if rng.random() < GOAL_SHARE else rng.uniform([-0.05, -np.pi], [0.05, np.pi])
         apart = [np.hypot((z[0] - target[0]) / radius, z[2] - target[1]) for z, _, _ in nodes]
@@ -101,19 +114,10 @@ def random_tree(scene: wa.Scene, by: dict, seconds: float, seed: int, max_phases
         move = moves[rng.integers(len(moves))]
         held = np.flatnonzero(np.minimum.accumulate(move.margins) > 0)[-1]
         for name, value in goal.values.items():  # ends on the goal where the move passes it
-            row = ("x", "y", "phi").index(name)
-            off = move.places[: held + 1, row] - value
-            crossing = np.flatnonzero(off[:-1] * off[1:] <= 0)
-            if len(crossing):
-                k = int(crossing[0])
-                place = (
-                    move.places[k + 1]
-                    if off[k] == off[k + 1]
-                    else move.places[k] + (off[k] / (off[k] - off[k + 1])) * (move.places[k + 1] - move.places[k])
-                )
-                found = make_plan(
-                    scene, start, (*steps, Step(move.contacts, move.toward, (name, value), place, 0.0)), 1.0, goal
-                )
+            passed = first_crossing(move.places[: held + 1], name, value)
+            if passed is not None:
+                last = Step(move.contacts, move.toward, (name, value), passed[1], 0.0)
+                found = make_plan(scene, start, (*steps, last), 1.0, goal)
                 if found is not None and found.bound > 0 and (best is None or found.bound > best.bound):
                     best = found
         if held == len(move.places) - 1:
