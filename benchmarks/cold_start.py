@@ -82,18 +82,23 @@ def environment(cache: Path, flags: str = "") -> dict[str, str]:
     return mine | {"XDG_CACHE_HOME": str(cache)} | ({"XLA_FLAGS": flags} if flags else {})
 
 
-def run(arguments, cache: Path, out: Path, flags: str = "") -> dict[str, float]:
-    """Wall times [s] of one process: to the first line that it prints, which is the first phase's, and to its exit."""
+def timed(command, surroundings: dict[str, str]) -> dict[str, float]:
+    """Wall times [s] of one process: to the first line that it prints, and to its exit."""
     begun = time.perf_counter()
-    command = [sys.executable, "-u", "-m", "wholearm_jax", *arguments, "--out", str(out)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, env=environment(cache, flags), **pipes) as process:
-        process.stdout.readline()
+    with subprocess.Popen(command, env=surroundings, **pipes) as process:
+        line = process.stdout.readline()
         first = time.perf_counter() - begun
         _, complaints = process.communicate()
-    if process.returncode == 2:
+    if process.returncode == 2 or not line:
         raise RuntimeError(complaints)
     return {"first": first, "exit": time.perf_counter() - begun}
+
+
+def run(arguments, cache: Path, out: Path, flags: str = "") -> dict[str, float]:
+    """The times of a command of the package, whose first line is the first phase's."""
+    command = [sys.executable, "-u", "-m", "wholearm_jax", *arguments, "--out", str(out)]
+    return timed(command, environment(cache, flags))
 
 
 def apart(arguments, cache: Path, out: Path) -> dict[str, float]:
@@ -131,12 +136,7 @@ def first_gradient(repeats: int, torque: Path) -> dict[str, dict[str, float]]:
             given = Path(folder, f"cache{k}"), layered_file("heptagon"), torque
             command = [sys.executable, "-u", "-c", GRADIENT, *map(str, given)]
             for kind in times:
-                begun = time.perf_counter()
-                with subprocess.Popen(command, env=environment(Path(folder)), stdout=subprocess.PIPE) as process:
-                    printed = process.stdout.readline()
-                    times[kind].append(time.perf_counter() - begun)
-                if not printed:
-                    raise RuntimeError("no gradient was printed")
+                times[kind].append(timed(command, environment(Path(folder)))["first"])
     seconds = {kind: statistics.median(several) for kind, several in times.items()}
     print(f"first gradient: {seconds['cold']:.1f} s, programs kept {seconds['kept']:.1f} s", flush=True)
     return {"seconds": seconds, "runs": times}

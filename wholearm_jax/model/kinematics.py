@@ -244,19 +244,18 @@ def tangential_jacobian(contacts: ContactSet, z: Float[Array, "5"]) -> Float[Arr
     return _jacobian_along(contacts, at, _rotate_minus_90(at.normal))
 
 
-@jax.jit
 def contact_velocity(
     contacts: ContactSet,
-    z: Float[Array, "5"],
+    at: ContactKinematics,
     x: Float[Array, "5"],
     gap: float | Float[Array, "contacts"],
     along: float | Float[Array, "contacts"],
 ) -> Float[Array, "contacts"]:
     """How fast `gap C_n + along a` changes where `z` moves at the rate `x`, `a` being places along features.
 
-    Both are velocities in a direction, so that a weighted sum of the directions, (`gap`, `along`), gives the sum.
+    Both are velocities in a direction, so that a weighted sum of the directions, (`gap`, `along`), gives the sum. `at`
+    are the contacts at `z`.
     """
-    at = contact_kinematics(contacts, z)
     (nx, ny), (tx, ty) = at.normal, _rotate_minus_90(at.normal)
     along = along * _feature_sign(contacts)
     return _velocity_along(contacts, at, (gap * nx + along * tx, gap * ny + along * ty), x)

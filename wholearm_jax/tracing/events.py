@@ -71,7 +71,7 @@ class EventFunctions(NamedTuple):
         here, (first, second) = contact_kinematics(self.contacts, z), self.joint_angle
         return EventValues(
             values=self._values(here, z),
-            rates=contact_velocity(self.contacts, z, slope, self.gap, self.along)
+            rates=contact_velocity(self.contacts, here, slope, self.gap, self.along)
             + self.coordinate_weight * slope[self.coordinate]
             + first * slope[3]
             + second * slope[4],
