@@ -15,7 +15,7 @@ import wholearm_jax as wa
 from wholearm_jax.core import as_device_array
 from wholearm_jax.margin import PROGRAMME_INTERVALS, rest_to_rest
 from wholearm_jax.model import replace_duration
-from wholearm_jax.optimisation import path_margin
+from wholearm_jax.optimisation import largest_margin
 
 
 def compare(scene: wa.Scene, seconds: float) -> list[str]:
@@ -27,7 +27,7 @@ def compare(scene: wa.Scene, seconds: float) -> list[str]:
     lines = []
     for path, bound, phase in zip(traced, pointwise, optimum.result.phases, strict=True):
         given = path.dynamics, as_device_array(seconds), rest_to_rest()
-        coarse, fine = (path_margin(*given, k * PROGRAMME_INTERVALS, 0) for k in (1, 2))
+        coarse, fine = (largest_margin(*given, 0, k * PROGRAMME_INTERVALS) for k in (1, 2))
         certificate, finer = float(coarse.margin), float(fine.margin)
         numbers = f"{float(bound.value):8.4f} {certificate:8.4f} {finer - certificate:9.1e} {phase.margin:8.4f}"
         steps = f"{phase.margin / certificate:7.4f} {int(coarse.iterations):4d} {bool(coarse.converged)}"

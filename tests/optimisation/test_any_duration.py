@@ -9,7 +9,7 @@ import wholearm_jax as wa
 from wholearm_jax.core import as_device_array
 from wholearm_jax.margin import PROGRAMME_INTERVALS, rest_to_rest
 from wholearm_jax.model import path_target, replace_duration
-from wholearm_jax.optimisation import path_margin
+from wholearm_jax.optimisation import largest_margin
 from wholearm_jax.phases import trace
 
 LENGTHENED = (1.1, 1.5, 2.5, 6.0, 20.0, 100.0)  # durations over the shortest possible ones
@@ -71,7 +71,7 @@ def test_more_intervals_lower_the_bound_by_little(plan):
     _, traced, shortest = plan
     duration = as_device_array(2 * shortest)
     coarse, fine = (
-        float(path_margin(traced[0].dynamics, duration, rest_to_rest(), n, 0).margin)
+        float(largest_margin(traced[0].dynamics, duration, rest_to_rest(), 0, n).margin)
         for n in (PROGRAMME_INTERVALS // 2, PROGRAMME_INTERVALS)
     )
     assert fine * (1 - 1e-6) <= coarse < fine * (1 + 2e-3)

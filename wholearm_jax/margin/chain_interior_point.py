@@ -6,13 +6,14 @@ With inequality functions `r` (`chain_constraints`) and the duration `t(b)`, whi
     minimise t(b)   subject to   the same with a given m and any T                    (the shortest time).
 
 Each Newton step eliminates `u` (and the sides' `a`) point by point, which leaves a tridiagonal system in `b`, bordered
-by `m` and the multiplier of the duration:
+by `m` and the multiplier `eta` of the duration:
 
     [ K    k_m   t' ] [ db  ]   [ f_b ]
     [ k_m' k_mm  0  ] [ dm  ] = [ f_m ]
     [ t''  0  -w/eta] [ eta ]   [ f_t ]
 
-Mehrotra's predictor and corrector choose the barrier parameter.
+For the shortest time `m` is given, `eta` is one, and the border goes. Which of the two is asked for is data, so that
+one program solves both. Mehrotra's predictor and corrector choose the barrier parameter.
 
 Derivation: section 8 of `docs/derivation.md`.
 """
@@ -92,7 +93,8 @@ class _NewtonSystem(NamedTuple):
     missing: ChainInequalities  # function minus slack
     weight: ChainInequalities  # multiplier over slack
     slopes: RowSlopes
-    timed: Bool[Array, ""]
+    timed: Bool[Array, ""]  # the time is limited
+    fast: Bool[Array, ""]  # the time is to be the shortest
     # Points
     hessian: _PointHessian
     margin_a: Float[Array, "points"]  # column of m, without u
@@ -108,16 +110,16 @@ class _NewtonSystem(NamedTuple):
     solved_time: Float[Array, "nodes"]
 
 
-def solve_chain(programme: PathProgramme, margin: Float[Array, ""] | None = None) -> ChainSolution:
+def solve_chain(programme: PathProgramme, margin: Float[Array, ""]) -> ChainSolution:
     """Solve a path programme for the largest margin, or for the shortest time with a margin.
 
     Args:
-        programme: Discretised problem.
-        margin: Margin, in force units, to be kept in the shortest time; None for the largest margin.
+        programme: Discretised problem, with any time where a margin is given.
+        margin: Margin, in force units, to be kept in the shortest time; NaN for the largest margin.
     """
-    p = stop_gradient(programme)
-    fast = margin is not None
-    x = _first_guess(p, None if margin is None else stop_gradient(margin))
+    p, margin = stop_gradient((programme, margin))
+    fast = ~jnp.isnan(margin)
+    x = _first_guess(p, margin)
     value = inequalities(p, x)
     slack = ChainInequalities(*(jnp.maximum(r, FIRST_SLACK) for r in value))
     allowed = jnp.where(jnp.isfinite(p.duration), p.duration, 1.0)
@@ -137,20 +139,20 @@ def solve_chain(programme: PathProgramme, margin: Float[Array, ""] | None = None
     return ChainSolution(at.x, at.multiplier, torque, duration(p, at.x.b), at.gap, at.residual, at.count, fine)
 
 
-def lagrangian(p: PathProgramme, solution: ChainSolution, margin: Float[Array, ""] | None = None) -> Float[Array, ""]:
+def lagrangian(p: PathProgramme, solution: ChainSolution, margin: Float[Array, ""]) -> Float[Array, ""]:
     """Lagrangian of the largest margin, or (given a `margin`) of the shortest time, at a solution that is held fixed.
 
     Its derivatives with respect to the programme and the margin are those of the optimum (envelope theorem).
     """
     solution = stop_gradient(solution)
     x, multiplier = solution.unknowns, solution.multipliers
-    timed = jnp.isfinite(p.duration) & (margin is None)
-    live = existing(p, timed)
-    x = x._replace(b=jnp.where(p.is_fixed, p.end_b, x.b), m=x.m if margin is None else margin)
+    fast = ~jnp.isnan(margin)
+    live = existing(p, jnp.isfinite(p.duration) & ~fast)
+    x = x._replace(b=jnp.where(p.is_fixed, p.end_b, x.b), m=jnp.where(fast, margin, x.m))
     value = inequalities(p, x)
     terms = zip(live, multiplier, value, strict=True)
     gained = sum(jnp.where(one > 0, z * r, 0.0).sum() for one, z, r in terms)
-    return x.m + gained if margin is None else duration(p, x.b) - gained
+    return jnp.where(fast, duration(p, x.b) - gained, x.m + gained)
 
 
 def _first_guess(p: PathProgramme, margin) -> ChainUnknowns:
@@ -163,12 +165,11 @@ def _first_guess(p: PathProgramme, margin) -> ChainUnknowns:
     b = jnp.minimum(jnp.clip(faster, 0.1, 4.0) * shape, p.cap / 2)
     zero = jnp.zeros(p.s.shape[0], b.dtype)
     x = ChainUnknowns(jnp.where(p.is_fixed, p.end_b, b), zero, zero, jnp.zeros((), b.dtype))
-    if margin is not None:
-        return x._replace(m=jnp.asarray(margin, b.dtype))
-    return x._replace(m=inequalities(p, x).rows[: p.force.shape[0]].min() - 0.5)
+    below = inequalities(p, x).rows[: p.force.shape[0]].min() - 0.5
+    return x._replace(m=jnp.where(jnp.isnan(margin), below, margin))
 
 
-def _iterate(p: PathProgramme, at: _Iterate, fast: bool) -> _Iterate:
+def _iterate(p: PathProgramme, at: _Iterate, fast) -> _Iterate:
     """Predict without a barrier, choose the barrier parameter by how far that step goes, correct, and step."""
     system = _assemble(p, at, fast)
     live, slack, multiplier = system.live, at.slack, at.multiplier
@@ -177,14 +178,14 @@ def _iterate(p: PathProgramme, at: _Iterate, fast: bool) -> _Iterate:
 
     # Predictor.
     none = ChainInequalities(*(jnp.zeros_like(s) for s in slack))
-    _, ds, dz = _direction(p, at, system, none, fast)
+    _, ds, dz = _direction(p, at, system, none)
     ahead = _moved(slack, ds, _feasible_fraction(slack, ds)), _moved(multiplier, dz, _feasible_fraction(multiplier, dz))
     sigma = jnp.clip((_product(live, *ahead) / count / barrier) ** 3, 1e-4, 1.0)
     level = jnp.maximum(sigma * barrier, jnp.minimum(barrier, RESIDUAL_FRACTION * at.residual))
 
     # Corrector.
     target = ChainInequalities(*(level - d * e for d, e in zip(ds, dz, strict=True)))
-    dx, ds, dz = _direction(p, at, system, target, fast)
+    dx, ds, dz = _direction(p, at, system, target)
     primal = jnp.minimum(1.0, TO_BOUNDARY * _feasible_fraction(slack, ds))
     dual = jnp.minimum(1.0, TO_BOUNDARY * _feasible_fraction(multiplier, dz))
     nonlinear, both = system.timed | fast, jnp.minimum(primal, dual)
@@ -196,10 +197,10 @@ def _iterate(p: PathProgramme, at: _Iterate, fast: bool) -> _Iterate:
     return _Iterate(x, slack, multiplier, jnp.asarray(_product(live, slack, multiplier)), residual, at.count + 1)
 
 
-def _assemble(p: PathProgramme, at: _Iterate, fast: bool) -> _NewtonSystem:
+def _assemble(p: PathProgramme, at: _Iterate, fast) -> _NewtonSystem:
     """Reduce the Newton system to the nodes and factor it."""
     n, facets = p.intervals, p.force.shape[0]
-    timed = jnp.isfinite(p.duration) & (not fast)
+    timed = jnp.isfinite(p.duration) & ~fast
     live = existing(p, timed)
     value = inequalities(p, at.x)
     missing = ChainInequalities(*(one * (r - s) for one, r, s in zip(live, value, at.slack, strict=True)))
@@ -216,7 +217,7 @@ def _assemble(p: PathProgramme, at: _Iterate, fast: bool) -> _NewtonSystem:
 
     # Tridiagonal matrix of the nodes.
     time = duration_slopes(p, at.x.b)
-    eta = 1.0 if fast else jnp.where(timed, at.multiplier.time, 0.0)
+    eta = jnp.where(fast, 1.0, jnp.where(timed, at.multiplier.time, 0.0))
     inverse = 1 / (2 * p.width)
     square, mixed, rate = hessian.kbb[:n] / 4, hessian.kba[:n] * inverse, hessian.kaa[:n] * inverse**2
     diagonal = at_nodes(square - mixed + rate, square + mixed + rate) + weight.low + weight.high + eta * time.diagonal
@@ -231,6 +232,7 @@ def _assemble(p: PathProgramme, at: _Iterate, fast: bool) -> _NewtonSystem:
         weight=weight,
         slopes=slopes,
         timed=timed,
+        fast=fast,
         hessian=hessian,
         margin_a=margin_a,
         margin_u=by_u,
@@ -264,7 +266,7 @@ def _reduce(p: PathProgramme, hessian: _PointHessian, by_b, by_a, by_u):
     return jnp.where(p.is_fixed, 0.0, at_nodes(half - rate, half + rate).at[p.side_node].add(side)), by_a
 
 
-def _direction(p: PathProgramme, at: _Iterate, system: _NewtonSystem, target: ChainInequalities, fast: bool):
+def _direction(p: PathProgramme, at: _Iterate, system: _NewtonSystem, target: ChainInequalities):
     """Steps of unknowns, slacks and multipliers towards products `target` of slacks and multipliers."""
     n, facets, hessian, slopes, live = p.intervals, p.force.shape[0], system.hessian, system.slopes, system.live
 
@@ -273,22 +275,21 @@ def _direction(p: PathProgramme, at: _Iterate, system: _NewtonSystem, target: Ch
     g = ChainInequalities(*(one * t / s - w * q for one, t, s, w, q in terms))
     by_b, by_a, by_u = ((g.rows * d).sum(0) for d in slopes[:3])
     right, reduced_a = _reduce(p, hessian, by_b, by_a, by_u)
-    right = right + jnp.where(p.is_fixed, 0.0, g.low - g.high) - (system.time_column if fast else 0.0)
+    right = right + jnp.where(p.is_fixed, 0.0, g.low - g.high) - jnp.where(system.fast, system.time_column, 0.0)
     solved = _solve(system.pivot, system.ratio, right[None])[0]
 
     # Border: the step of the margin and the new multiplier of the duration.
-    dm, eta = jnp.zeros_like(at.x.m), jnp.zeros_like(at.x.m)
-    if not fast:
-        side = (system.margin_a[n:] * reduced_a[n:] / hessian.kaa[n:]).sum()
-        f_m = 1 - g.rows[:facets].sum() - (system.margin_u * by_u / hessian.uu).sum() - side
-        f_m = f_m - system.margin_column @ solved
-        f_t = -target.time / at.multiplier.time + system.missing.time - system.time_column @ solved
-        mm = system.margin_corner - system.margin_column @ system.solved_margin
-        mt = -system.margin_column @ system.solved_time
-        tt = system.time_corner - system.time_column @ system.solved_time
-        determinant = mm * tt - mt**2
-        dm = jnp.where(system.timed, (f_m * tt - mt * f_t) / determinant, f_m / mm)
-        eta = jnp.where(system.timed, (mm * f_t - mt * f_m) / determinant, 0.0)
+    side = (system.margin_a[n:] * reduced_a[n:] / hessian.kaa[n:]).sum()
+    f_m = 1 - g.rows[:facets].sum() - (system.margin_u * by_u / hessian.uu).sum() - side
+    f_m = f_m - system.margin_column @ solved
+    f_t = -target.time / at.multiplier.time + system.missing.time - system.time_column @ solved
+    mm = system.margin_corner - system.margin_column @ system.solved_margin
+    mt = -system.margin_column @ system.solved_time
+    tt = system.time_corner - system.time_column @ system.solved_time
+    determinant = mm * tt - mt**2
+    dm = jnp.where(system.timed, (f_m * tt - mt * f_t) / determinant, f_m / mm)
+    dm = jnp.where(system.fast, 0.0, dm)
+    eta = jnp.where(system.timed, (mm * f_t - mt * f_m) / determinant, 0.0)
 
     # Back to the points, then slacks and multipliers.
     db = solved - system.solved_margin * dm - system.solved_time * eta

@@ -44,47 +44,36 @@ class PathOptimum(eqx.Module):
     iterations: Int[Array, ""]
 
 
-def largest_margin(
+def solve_path(
     dynamics: PathDynamics,
     duration: Float[Array, ""],
-    speeds: SpeedRange,
-    intervals: int = PROGRAMME_INTERVALS,
-    rolling: int = MAX_ROLLING,
-) -> PathOptimum:
-    """Return the motion with the largest margin under any torque within limits.
-
-    Args:
-        dynamics: tabulated path dynamics.
-        duration: time allowed [s]; infinite for any.
-        speeds: speeds allowed at the ends and on the way.
-        intervals: number of intervals; the error falls with its square.
-        rolling: largest number of rolling contacts that the formation may have.
-
-    Returns:
-        The optimum; not `converged` where no motion takes so little time.
-    """
-    programme = discretise(dynamics, duration, speeds, intervals, rolling)
-    solution = solve_chain(programme)
-    value = lagrangian(programme, solution) * programme.force_unit
-    return _in_si_units(dynamics, programme, solution, value, solution.duration * programme.time_unit)
-
-
-def shortest_duration(
-    dynamics: PathDynamics,
     margin: Float[Array, ""],
     speeds: SpeedRange,
     intervals: int = PROGRAMME_INTERVALS,
     rolling: int = MAX_ROLLING,
 ) -> PathOptimum:
-    """Return the fastest motion that keeps a `margin` [N]; see `largest_margin`.
+    """Return the motion with the largest margin under any torque within limits, or the fastest with a given one.
 
-    Multipliers are those of the time: `facet_weight` sums to its growth with the margin, in their units.
+    Args:
+        dynamics: tabulated path dynamics.
+        duration: time allowed [s]; infinite for any, and where a margin is given.
+        margin: margin to be kept by the fastest motion [N]; NaN for the largest. Multipliers are then those of the
+            time: `facet_weight` sums to its growth with the margin, in their units.
+        speeds: speeds allowed at the ends and on the way.
+        intervals: number of intervals; the error falls with its square.
+        rolling: largest number of rolling contacts that the formation may have.
+
+    Returns:
+        The optimum; not `converged` where no motion takes so little time, or has such a margin.
     """
-    programme = discretise(dynamics, jnp.full_like(margin, jnp.inf), speeds, intervals, rolling)
+    programme = discretise(dynamics, duration, speeds, intervals, rolling)
     kept = margin / programme.force_unit
     solution = solve_chain(programme, kept)
-    value = lagrangian(programme, solution, kept) * programme.time_unit
-    return _in_si_units(dynamics, programme, solution, margin, value)
+    value = lagrangian(programme, solution, kept)
+    fast = ~jnp.isnan(margin)
+    best_margin = jnp.where(fast, margin, value * programme.force_unit)
+    best_duration = jnp.where(fast, value, solution.duration) * programme.time_unit
+    return _in_si_units(dynamics, programme, solution, best_margin, best_duration)
 
 
 def _in_si_units(dynamics: PathDynamics, p: PathProgramme, solution: ChainSolution, margin, duration) -> PathOptimum:

@@ -7,10 +7,11 @@ Derivation: section 8 of `docs/derivation.md`.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from wholearm_jax.core import CachedJit, Status, as_device_array, require_x64
-from wholearm_jax.margin import PROGRAMME_INTERVALS, PathOptimum, SpeedRange, largest_margin, shortest_duration
+from wholearm_jax.dynamics import PathDynamics
+from wholearm_jax.margin import PROGRAMME_INTERVALS, PathOptimum, SpeedRange, solve_path
 from wholearm_jax.model import Arrival, Phase, Scene
 from wholearm_jax.optimisation.quasistatic_plan import rolling_count
 from wholearm_jax.phases import TracedPhase, starts_at_rest, trace
@@ -77,7 +78,7 @@ def convex_bounds(
 
     def solve(path, phase, speeds):
         seconds = as_device_array(np.inf) if any_duration else phase.duration
-        return path_margin(path.dynamics, seconds, speeds, PROGRAMME_INTERVALS, rolling_count(phase))
+        return largest_margin(path.dynamics, seconds, speeds, rolling_count(phase))
 
     return _each_phase(scene, traced, solve)
 
@@ -103,10 +104,27 @@ def shortest_motions(
     """
 
     def solve(path, phase, speeds):
-        rolling = rolling_count(phase)
-        return path_duration(path.dynamics, as_device_array(float(margin)), speeds, PROGRAMME_INTERVALS, rolling)
+        return shortest_duration(path.dynamics, as_device_array(float(margin)), speeds, rolling_count(phase))
 
     return _each_phase(scene, traced, solve)
+
+
+def largest_margin(
+    dynamics: PathDynamics,
+    duration: Float[Array, ""],
+    speeds: SpeedRange,
+    rolling: int,
+    intervals: int = PROGRAMME_INTERVALS,
+) -> PathOptimum:
+    """Return the motion with the largest margin in a duration; see `solve_path`."""
+    return _solve_path(dynamics, duration, as_device_array(np.nan), speeds, intervals, rolling)
+
+
+def shortest_duration(
+    dynamics: PathDynamics, margin: Float[Array, ""], speeds: SpeedRange, rolling: int
+) -> PathOptimum:
+    """Return the fastest motion with a margin; see `solve_path`."""
+    return _solve_path(dynamics, as_device_array(np.inf), margin, speeds, PROGRAMME_INTERVALS, rolling)
 
 
 def _each_phase(scene: Scene, traced, solve) -> tuple[BestMotion | None, ...]:
@@ -151,5 +169,4 @@ def _places(optimum: PathOptimum):
     return optimum.node_s, optimum.point_s, optimum.hardest_s
 
 
-path_margin = CachedJit(largest_margin)
-path_duration = CachedJit(shortest_duration)
+_solve_path = CachedJit(solve_path)

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from wholearm_jax.core import as_device_array
-from wholearm_jax.margin import PROGRAMME_INTERVALS, PathOptimum, rest_to_rest
+from wholearm_jax.margin import PathOptimum, rest_to_rest
 from wholearm_jax.model import Phase, Scene, TorqueSchedule, concatenate_schedules, torque_schedule
-from wholearm_jax.optimisation.best_motion import path_duration, path_margin
+from wholearm_jax.optimisation.best_motion import largest_margin, shortest_duration
 from wholearm_jax.optimisation.initial_guess import UnitMotion
 from wholearm_jax.optimisation.quasistatic_plan import rolling_count
 from wholearm_jax.phases import HandOver, TracedPhase, statics_at_start
@@ -65,7 +65,7 @@ def convex_starts(
     rest, dynamics, rolling = rest_to_rest(), traced.dynamics, rolling_count(phase)
 
     def optimum(time: float) -> PathOptimum:
-        return path_margin(dynamics, as_device_array(time), rest, PROGRAMME_INTERVALS, rolling)
+        return largest_margin(dynamics, as_device_array(time), rest, rolling)
 
     whole = optimum(duration)
     if not bool(whole.converged):
@@ -74,7 +74,7 @@ def convex_starts(
     if not may_wait:
         return starts
     near = as_device_array(NEAR_MARGIN * float(whole.margin))
-    sensible = path_duration(dynamics, near, rest, PROGRAMME_INTERVALS, rolling)
+    sensible = shortest_duration(dynamics, near, rest, rolling)
     moving = GOOD_MOVING_TIME * float(sensible.duration)
     if not bool(sensible.converged) or duration <= moving:
         return starts

@@ -5,9 +5,9 @@ import optax
 
 from wholearm_jax.core import BackgroundTask, as_device_array, compile_in_background
 from wholearm_jax.dynamics import placeholder_dynamics
-from wholearm_jax.margin import PROGRAMME_INTERVALS, rest_to_rest
+from wholearm_jax.margin import rest_to_rest
 from wholearm_jax.model import Arrival, Scene, round_up
-from wholearm_jax.optimisation.best_motion import path_duration, path_margin
+from wholearm_jax.optimisation.best_motion import largest_margin
 from wholearm_jax.optimisation.constraints import Limits
 from wholearm_jax.optimisation.coupled_phases import (
     GUESS_TORQUE_FRACTION,
@@ -47,8 +47,7 @@ def _compile_guesses(sizes: tuple[int, ...], rolling: tuple[int, ...], knots: in
     dynamics, one = placeholder_dynamics(Resolution()), as_device_array(1.0)
     for count in rolling:
         upper_bound(dynamics, one, as_device_array(True), as_device_array(True), count)
-        for solve in (path_margin, path_duration):
-            solve(dynamics, one, rest_to_rest(), PROGRAMME_INTERVALS, count)
+        largest_margin(dynamics, one, rest_to_rest(), count)
     for phases in sizes:
         initial_guesses([dynamics] * phases, np.ones(phases), knots, GUESS_TORQUE_FRACTION)
 
