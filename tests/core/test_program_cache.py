@@ -7,7 +7,10 @@ import json
 import pickle
 import shutil
 import sys
+import threading
+import time
 import types
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import equinox as eqx
@@ -261,3 +264,22 @@ def test_the_package_unpickles_nothing():
         source = path.read_text()
         assert "import pickle" not in source, path
         assert "allow_pickle=True" not in source, path
+
+
+def test_threads_that_ask_for_one_program_build_it_once():
+    traced, begin = [], threading.Barrier(2)
+
+    def slow(x):
+        traced.append(threading.current_thread())
+        time.sleep(0.2)
+        return x + 1
+
+    program = program_cache.CachedJit(slow)
+
+    def ask(_):
+        begin.wait(60)
+        return float(program(np.ones(())))
+
+    with ThreadPoolExecutor(2) as threads:
+        assert list(threads.map(ask, range(2))) == [2.0, 2.0]
+    assert len(traced) == 1

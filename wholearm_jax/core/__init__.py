@@ -13,7 +13,7 @@ from wholearm_jax.core.arrays import (
 )
 from wholearm_jax.core.atomic_files import write_atomically, write_together
 from wholearm_jax.core.background_compile import BackgroundTask, compile_in_background, wait_for
-from wholearm_jax.core.config import configure
+from wholearm_jax.core.config import LOOPS_AS_KERNELS, configure
 from wholearm_jax.core.errors import BadInput, DoubtfulInput, SceneError, StoreError
 from wholearm_jax.core.executable_cache import discard_unreadable_entry, keep_compiled
 from wholearm_jax.core.linear_programme import LinearProgramme, LinearProgrammeSolution

@@ -1,4 +1,4 @@
-"""Compilation in a background thread.
+"""Compilation in background threads.
 
 Python traces one program at a time, whatever the number of threads, but XLA can compile several. A command queues calls
 that compile the programs it will need later; the queue starts once the first program has been traced.
@@ -13,11 +13,12 @@ from typing import Any
 import jax
 import numpy as np
 
+WORKERS = 2
 ARRAY_TYPES = (jax.Array, np.ndarray, np.generic)
 
 
 class BackgroundTask:
-    """A call made on the background thread for the programs that it compiles; its return value is dropped."""
+    """A call made on a background thread for the programs that it compiles; its return value is dropped."""
 
     def __init__(self, function: Callable, args: tuple) -> None:
         self._calls, self._done = [(function, args)], Future()
@@ -44,7 +45,7 @@ class BackgroundTask:
 
 
 def compile_in_background(function: Callable, *args) -> BackgroundTask:
-    """Queue `function(*args)` on the background thread and return its task.
+    """Queue `function(*args)` for the background threads and return its task.
 
     The same function and argument shapes give the same task, unless it failed. The queue starts when the next program
     has been traced, or at `wait_for`.
@@ -68,10 +69,10 @@ def wait_for(*tasks: BackgroundTask) -> None:
 
 
 def start_queued() -> None:
-    """Hand the queued tasks to the background thread."""
+    """Hand the queued tasks to the background threads."""
     with _queue_lock:
         while _queue:
-            _thread().submit(_queue.pop(0).run)
+            _threads().submit(_queue.pop(0).run)
 
 
 _tasks: dict[Any, BackgroundTask] = {}
@@ -80,5 +81,5 @@ _queue_lock = threading.Lock()
 
 
 @functools.cache
-def _thread() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(1)
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(WORKERS)

@@ -17,6 +17,7 @@ import gc
 import hashlib
 import json
 import os
+import threading
 import types
 from collections.abc import Callable
 from importlib.metadata import version
@@ -58,6 +59,7 @@ class CachedJit:
         self._function, self._name = function, function.__qualname__
         self._compiler_options = compiler_options
         self._programs: dict[Any, Callable] = {}
+        self._locks: dict[Any, threading.Lock] = {}
 
     def __call__(self, *args):
         leaves, tree = jax.tree.flatten(args)
@@ -69,16 +71,24 @@ class CachedJit:
         key = tree, settings, folder, shapes
         program = self._programs.get(key)
         if program is None:
-            lowered = self._read_or_export(folder, arrays, tree, settings) if folder else None
-            compiler_options = None if traced else self._compiler_options
-            program = jax.jit(self._of_arrays(tree, settings), compiler_options=compiler_options)
-            if not (traced or lowered):
-                with _garbage_collection_paused():
-                    program.trace(*arrays).lower()  # all that needs Python; the first call compiles it
-            if not traced:
-                start_queued()
-            program = self._programs[key] = _compile(*lowered, self._compiler_options) if lowered else program
+            with self._locks.setdefault(key, threading.Lock()):  # another thread may be compiling it
+                program = self._programs.get(key) or self._build(arrays, tree, settings, folder, traced)
+                self._programs[key] = program
         return program(*arrays)
+
+    def _build(self, arrays, tree, settings, folder, traced: bool) -> Callable:
+        """Return the program for such arguments, compiled where it comes from a folder."""
+        lowered = self._read_or_export(folder, arrays, tree, settings) if folder else None
+        if lowered:
+            start_queued()
+            return _compile(*lowered, self._compiler_options)
+        if traced:
+            return jax.jit(self._of_arrays(tree, settings))
+        program = jax.jit(self._of_arrays(tree, settings), compiler_options=self._compiler_options)
+        with _garbage_collection_paused():
+            program.trace(*arrays).lower()  # all that needs Python; the first call compiles it
+        start_queued()
+        return program
 
     def compiled_count(self) -> int:
         """Return the number of programs that it has compiled, without those read from files."""

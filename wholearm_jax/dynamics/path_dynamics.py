@@ -60,6 +60,11 @@ class PathDynamics(eqx.Module):
         """The path's extent in `s`."""
         return self.breakpoints[..., -1] - self.breakpoints[..., 0]
 
+    def range(self) -> tuple[float, float]:
+        """Return where the path begins in `s`, and its extent, as numbers."""
+        breakpoints = np.asarray(self.breakpoints)
+        return float(breakpoints[0]), float(breakpoints[-1] - breakpoints[0])
+
 
 def locate_panel(
     dynamics: PathDynamics, segment: Int[Array, ""], s: Float[Array, ""]

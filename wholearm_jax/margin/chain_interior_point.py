@@ -176,16 +176,19 @@ def _iterate(p: PathProgramme, at: _Iterate, fast) -> _Iterate:
     count = sum(one.sum() for one in live)
     barrier = _product(live, slack, multiplier) / count
 
-    # Predictor.
-    none = ChainInequalities(*(jnp.zeros_like(s) for s in slack))
-    _, ds, dz = _direction(p, at, system, none)
-    ahead = _moved(slack, ds, _feasible_fraction(slack, ds)), _moved(multiplier, dz, _feasible_fraction(multiplier, dz))
-    sigma = jnp.clip((_product(live, *ahead) / count / barrier) ** 3, 1e-4, 1.0)
-    level = jnp.maximum(sigma * barrier, jnp.minimum(barrier, RESIDUAL_FRACTION * at.residual))
+    # Predictor (without a barrier) and corrector: two passes of one loop, which is compiled once.
+    def improve(_, before):
+        _, ds, dz, level = before
+        target = ChainInequalities(*(level - d * e for d, e in zip(ds, dz, strict=True)))
+        dx, ds, dz = _direction(p, at, system, target)
+        slack_ahead = _moved(slack, ds, _feasible_fraction(slack, ds))
+        multiplier_ahead = _moved(multiplier, dz, _feasible_fraction(multiplier, dz))
+        sigma = jnp.clip((_product(live, slack_ahead, multiplier_ahead) / count / barrier) ** 3, 1e-4, 1.0)
+        level = jnp.maximum(sigma * barrier, jnp.minimum(barrier, RESIDUAL_FRACTION * at.residual))
+        return dx, ds, dz, level
 
-    # Corrector.
-    target = ChainInequalities(*(level - d * e for d, e in zip(ds, dz, strict=True)))
-    dx, ds, dz = _direction(p, at, system, target)
+    none = jax.tree.map(jnp.zeros_like, (at.x, slack, slack, barrier))
+    dx, ds, dz, _ = jax.lax.fori_loop(0, 2, improve, none)
     primal = jnp.minimum(1.0, TO_BOUNDARY * _feasible_fraction(slack, ds))
     dual = jnp.minimum(1.0, TO_BOUNDARY * _feasible_fraction(multiplier, dz))
     nonlinear, both = system.timed | fast, jnp.minimum(primal, dual)

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core import LinearProgramme, LinearProgrammeSolution
+from wholearm_jax.core import CachedJit, LinearProgramme, LinearProgrammeSolution
 from wholearm_jax.model import (
     ContactFormation,
     Scene,
@@ -189,7 +189,7 @@ def without_joint(statics: Statics, finger: int) -> Statics:
     return replace(statics, wrench=wrench, load=load)
 
 
-@jax.jit
+@CachedJit
 def _contact_rows(scene: Scene, formation: ContactFormation, z):
     mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, formation)
     here = z / mechanics.configuration_unit

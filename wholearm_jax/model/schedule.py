@@ -1,10 +1,8 @@
 """Torque schedules: two joint torques over time, linear between rows; a repeated time is a step."""
 
-from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -137,14 +135,15 @@ def round_up(rows: int, multiple: int = ROW_MULTIPLE) -> int:
     return -(-rows // multiple) * multiple
 
 
-@partial(jax.jit, static_argnames="multiple")
 def pad_schedule(schedule: TorqueSchedule, multiple: int = ROW_MULTIPLE) -> TorqueSchedule:
     """Pad a schedule, or several along leading axes, with rows after its end that repeat the last torque."""
-    times, values = schedule.times, schedule.values
+    # Numbers are padded in NumPy: no program for each shape.
+    xp: Any = jnp if is_traced(schedule) else np
+    times, values = xp.asarray(schedule.times), xp.asarray(schedule.values)
     missing = round_up(times.shape[-1], multiple) - times.shape[-1]
     ramp = times[..., -1:] + (times[..., -1:] - times[..., :1]) * np.arange(1, missing + 1, dtype=times.dtype)
-    rows = jnp.repeat(values[..., -1:, :], missing, axis=-2)
-    return TorqueSchedule(jnp.concatenate([times, ramp], -1), jnp.concatenate([values, rows], -2))
+    rows = xp.repeat(values[..., -1:, :], missing, axis=-2)
+    return TorqueSchedule(xp.concatenate([times, ramp], -1), xp.concatenate([values, rows], -2))
 
 
 def restrict_to_phase(schedule: TorqueSchedule, start: Float[Array, ""], duration: Float[Array, ""]) -> PhaseSchedule:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core import CachedJit, Status, as_device_array, require_x64
+from wholearm_jax.core import LOOPS_AS_KERNELS, CachedJit, Status, as_device_array, require_x64
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.margin import PROGRAMME_INTERVALS, PathOptimum, SpeedRange, solve_path
 from wholearm_jax.model import Arrival, Phase, Scene
@@ -143,7 +143,7 @@ def _each_phase(scene: Scene, traced, solve) -> tuple[BestMotion | None, ...]:
 
 def _best_motion(path: TracedPhase, phase: Phase, optimum: PathOptimum) -> BestMotion:
     """Bring an optimum to the host, with the contacts' names."""
-    begin, length = float(path.dynamics.breakpoints[0]), float(path.dynamics.length)
+    begin, length = path.dynamics.range()
     place, point_place, critical = ((np.asarray(s) - begin) / length for s in _places(optimum))
     feasible = bool(optimum.converged)
     formation = phase.formation
@@ -169,4 +169,4 @@ def _places(optimum: PathOptimum):
     return optimum.node_s, optimum.point_s, optimum.hardest_s
 
 
-_solve_path = CachedJit(solve_path)
+_solve_path = CachedJit(solve_path, compiler_options=LOOPS_AS_KERNELS)

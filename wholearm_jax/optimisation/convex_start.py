@@ -99,13 +99,13 @@ def wait_before(wait: Wait, schedule: TorqueSchedule) -> TorqueSchedule:
 def _unit_motion(optimum: PathOptimum, traced: TracedPhase, knots: int) -> UnitMotion:
     """Sample an optimum at even times: place, speed and acceleration over unit length and time."""
     time, s, v = (np.asarray(a) for a in (optimum.time, optimum.node_s, optimum.speed))
-    length, duration = float(traced.dynamics.length), time[-1]
+    (begin, length), duration = traced.dynamics.range(), time[-1]
     u = np.linspace(0.0, 1.0, knots)
 
     # The speed is linear in time within an interval: the place is quadratic.
     k = np.clip(np.searchsorted(time, u * duration, side="right") - 1, 0, len(time) - 2)
     x = (u * duration - time[k]) / (time[k + 1] - time[k])
     covered = (v[k] * x + (v[k + 1] - v[k]) * x**2 / 2) / ((v[k] + v[k + 1]) / 2)
-    place = (s[k] + covered * (s[k + 1] - s[k]) - s[0]) / length
+    place = (s[k] + covered * (s[k + 1] - s[k]) - begin) / length
     speed = (v[k] + (v[k + 1] - v[k]) * x) * duration / length
     return place, speed, np.gradient(speed, u)

@@ -59,7 +59,8 @@ def tighten_bounds(
             return bound
         if moves and motion.margin >= float(bound.value):
             return bound
-        s = path.dynamics.breakpoints[0] + motion.hardest_place * path.dynamics.length
+        begin, length = path.dynamics.range()
+        s = begin + motion.hardest_place * length
         return MarginBound(*(as_device_array(a) for a in (motion.margin, s, motion.hardest_place)))
 
     return tuple(tighter(*row) for row in zip(pointwise, motions, traced, cannot_wait, strict=True))
@@ -73,7 +74,7 @@ def limit_by_hand_overs(
     def limited(bound: MarginBound, hand_over: HandOver | None, path: TracedPhase) -> MarginBound:
         if hand_over is None or (margin := hand_over.margin) > 0:
             return bound
-        return MarginBound(*(as_device_array(a) for a in (margin, path.dynamics.breakpoints[0], 0.0)))
+        return MarginBound(*(as_device_array(a) for a in (margin, path.dynamics.range()[0], 0.0)))
 
     return tuple(limited(*row) for row in zip(margin_bounds, hand_overs, traced, strict=True))
 

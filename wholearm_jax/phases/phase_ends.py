@@ -50,13 +50,15 @@ def target_configuration(phase: Phase, traced: TracedPhase) -> Float[Array, "5"]
 
 def statics_at_start(scene: Scene, phase: Phase, traced: TracedPhase) -> tuple[Statics, RestAccelerations]:
     """Return the statics at a phase's start, and the accelerations with which the object would depart from there."""
-    dynamics = traced.dynamics
-    panel, xi = locate_panel(dynamics, jnp.asarray(0, int), dynamics.breakpoints[0])
-    forward, backward = jax.device_get(
-        (evaluate(dynamics.acceleration, panel, xi), evaluate(dynamics.reverse_acceleration, panel, xi))
-    )
+    forward, backward = jax.device_get(_start_accelerations(traced.dynamics))
     statics = contact_statics(scene, phase.formation, traced.begin)
     return statics, RestAccelerations(forward[[0, 3, 4]], backward)
+
+
+@jax.jit
+def _start_accelerations(dynamics: PathDynamics) -> tuple[Float[Array, "5"], Float[Array, "3"]]:
+    panel, xi = locate_panel(dynamics, jnp.asarray(0, int), dynamics.breakpoints[0])
+    return evaluate(dynamics.acceleration, panel, xi), evaluate(dynamics.reverse_acceleration, panel, xi)
 
 
 def formation_at_end(scene: Scene, phase: Phase, traced: TracedPhase) -> ContactFormation:
