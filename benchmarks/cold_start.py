@@ -183,8 +183,7 @@ def main() -> None:
     given = parser.parse_args()
     knots = Path(__file__).parent / "data" / "heptagon_knots.csv"
     if given.gradient:
-        kept = json.loads((measure.RESULTS / "cold_start.json").read_text())
-        measure.save("cold_start", kept | {"gradient": first_gradient(given.repeats, knots)})
+        measure.save("cold_start", measure.kept("cold_start") | {"gradient": first_gradient(given.repeats, knots)})
         return
     with tempfile.TemporaryDirectory() as folder:
         if given.quick:

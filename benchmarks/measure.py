@@ -61,6 +61,13 @@ def save(name: str, result: Mapping) -> Path:
     return path
 
 
+def kept(name: str) -> dict:
+    """The results that an earlier run has written, without its machine; none if none has."""
+    path = RESULTS / f"{name}.json"
+    results = json.loads(path.read_text()) if path.exists() else {}
+    return {key: value for key, value in results.items() if key != "machine"}
+
+
 def _installed(name: str) -> bool:
     try:
         metadata.version(name)

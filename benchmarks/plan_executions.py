@@ -8,7 +8,8 @@ default time step: open loop, and where that does not succeed, as where errors g
 `wholearm optimise --feedback` for the largest range of friction that it holds (20, 10, 5 % or the nominal one), at
 1 kHz, 1 ms late, with encoders of 4096 counts and 1 % of torque noise. An execution succeeds within 0.5 mm and
 0.01 rad of the predicted end, the last contacts closed and no link met that should not be.
-Prints and writes how many plans are optimised, how many executions succeed, and what became of the others.
+Prints and writes how many plans are optimised, how many executions succeed, and what became of the others; with
+`--plans 0` or `--regrasps 0` the results of that kind stay as they are kept.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from collections.abc import Iterator
 from itertools import islice
 
 import numpy as np
-from measure import save
+from measure import kept, save
 from planning import GOALS, HANDS, at_rest, objects
 
 import wholearm_jax as wa
@@ -134,7 +135,7 @@ def main() -> None:
     for label, rows in found.items():
         report(label, rows)
     if not given.quick:
-        save("plan_executions", found)
+        save("plan_executions", kept("plan_executions") | found)
 
 
 if __name__ == "__main__":
