@@ -45,7 +45,7 @@ from wholearm_jax.margin.path_programme import PathProgramme
 MAX_CHAIN_ITERATIONS = 100
 GAP_TOLERANCE = 1e-9  # sum of slacks times multipliers, in force units (or units of time)
 RESIDUAL_TOLERANCE = 1e-8
-RESIDUAL_FRACTION = 0.01  # the barrier parameter stays above this times the residual: feasibility first
+RESIDUAL_FRACTION = 1e-4  # the barrier parameter stays above this times the residual: feasibility first
 TO_BOUNDARY = 0.99  # fraction of the step to the nearest bound
 FIRST_SLACK = 0.1  # least slack to begin with
 
