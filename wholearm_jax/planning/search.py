@@ -2,7 +2,8 @@ r"""Search from a configuration to a goal, over the moves between contact format
 
 Nodes are configurations; moves lead from one to the next (`moves_from`). A move may be left at its path's end, where a
 coordinate of the goal has its value, or at a few places between, from where others may begin. The search is best-first
-by the number of phases and an estimate of those still needed, and drops moves whose margin is below the floor. A plan
+by the number of phases and an estimate of those still needed, and drops moves whose margin is below the floor. With
+regrasps, where plans are long, the estimate weighs more: the search goes for a plan rather than the shortest. A plan
 that it finds is traced anew, at full resolution, and judged by its certificate: the least upper bound of its phases.
 Once there are as many plans as wanted, the floor rises to the least certificate among them, so that from then on only
 better ones count; the search ends when it has gone on as long again without finding one.
@@ -38,10 +39,10 @@ from wholearm_jax.planning.successors import touching_contacts
 STOPS = (1 / 3, 2 / 3)  # fractions of a path at which other moves may begin
 MERGE_TOL = 1e-5  # configurations closer than this, in object radii and radians, are one node
 TYPICAL_SHIFT, TYPICAL_TURN = 0.5, 0.5  # of one move [object radii, rad], for the estimate of phases to come
-SEARCH_PATIENCE, LEAST_PATIENCE = (
-    1.0,
-    20,
-)  # nodes without a better plan, over those up to the last one; at least so many
+REGRASPING_WEIGHT = 3.0  # of that estimate where fingers may regrasp
+LONGEST_PLAN, LONGEST_REGRASPING_PLAN = 5, 24  # phases
+SEARCH_PATIENCE = 1.0  # nodes without a better plan, over those up to the last one,
+LEAST_PATIENCE = 20  # and at least so many
 
 
 @dataclass
@@ -77,7 +78,7 @@ def plan(
     tolerance: Mapping[str, float] | None = None,
     margin: float = 0.0,
     count: int = 3,
-    max_phases: int = 5,
+    max_phases: int | None = None,
     rolling: bool = True,
     regrasp_cost: float | None = None,
     time_limit: float = 60.0,
@@ -94,7 +95,7 @@ def plan(
         tolerance: distances from the goal that are good enough; 1 mm and 1 degree unless given.
         margin: least margin [N] that a plan must allow.
         count: number of plans to return at most.
-        max_phases: longest plan.
+        max_phases: longest plan; 5 unless given, with regrasps 24.
         rolling: whether contacts may roll.
         regrasp_cost: allow regrasps: a finger may leave the object, stand still away from it while the other one moves
             the object, and touch it again. Each time that a finger moves alone counts as so many phases more. None: no
@@ -122,7 +123,7 @@ def plan(
         goal=make_goal(start, goal, by=by, tolerance=tolerance),
         floor=margin,
         radius=float(np.hypot(*np.asarray(rigid_body(scene.object).vertices).T).max()),
-        max_phases=max_phases,
+        max_phases=max_phases or (LONGEST_PLAN if regrasp_cost is None else LONGEST_REGRASPING_PLAN),
         duration=duration,
         count=count,
         rolling=rolling,
@@ -170,6 +171,7 @@ def _run(
         if search.plans and _has_lost_patience(search):
             return False
         if time.monotonic() - begin > time_limit or search.nodes == max_nodes:
+            _add_waiting_plans(search)
             return True
         _expand(search, z, steps, names)
         if search.nodes == 1:  # the first expansion compiles: that is no time of the search
@@ -177,6 +179,15 @@ def _run(
         if callback is not None:
             callback(search.nodes, search.nearest[0])
     return False
+
+
+def _add_waiting_plans(search: _Search) -> None:
+    """Add plans that have been found but not judged, those of fewest phases first, until there are enough."""
+    for _, _, z, steps, _ in sorted(search.queue):
+        if len(search.plans) == search.count:
+            return
+        if steps and search.goal.is_reached(z):
+            _add_plan(search, steps)
 
 
 def _has_lost_patience(search: _Search) -> bool:
@@ -211,7 +222,8 @@ def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tup
     distance = _phases_to_go(search, z)
     if distance < search.nearest[0] - 1e-9:
         search.nearest = (distance, steps)
-    heapq.heappush(search.queue, (_cost(search, steps) + distance, next(search.order), z, steps, touching))
+    weight = 1.0 if search.regrasp_cost is None else REGRASPING_WEIGHT
+    heapq.heappush(search.queue, (_cost(search, steps) + weight * distance, next(search.order), z, steps, touching))
 
 
 def _cost(search: _Search, steps: tuple[Step, ...]) -> float:
