@@ -14,6 +14,7 @@ from wholearm_jax.files.scene_toml import SceneError, to_dict
 from wholearm_jax.model import resting_configuration
 from wholearm_jax.planning.goal import make_goal
 from wholearm_jax.planning.moves import moves_from
+from wholearm_jax.planning.search import SHORT_PLAN
 from wholearm_jax.planning.successors import successor_formations
 
 
@@ -88,6 +89,33 @@ def test_a_finger_moves_alone_only_where_regrasps_are_allowed():
     assert [step.regrasp for step in found.plans[0].steps] == ["finger1:away"]
     assert found.plans[0].bound > 0
     assert wa.optimise(found.plans[0].scene, knots=11).result.status is wa.Status.OK
+
+
+@pytest.mark.parametrize(
+    ("name", "degrees", "regrasp_cost"),
+    [
+        ("heptagon", -90, None),
+        pytest.param("heptagon", 90, 1.0, marks=pytest.mark.slow),
+        pytest.param("hexagon", -90, None, marks=pytest.mark.slow),
+    ],
+)
+def test_an_object_is_tumbled(name, degrees, regrasp_cost):
+    """By a turn that takes more phases than the search for short plans allows."""
+    scene = wa.load(name)
+    found = wa.plan(scene, by={"phi": np.radians(degrees)}, regrasp_cost=regrasp_cost, count=1, max_nodes=1500)
+    plan = found.plans[0]
+    assert len(plan.steps) > SHORT_PLAN
+    optimum = wa.optimise(plan.scene, knots=21)
+    assert optimum.result.status is wa.Status.OK
+    traced = wa.trace(optimum.scene)
+    assert float(traced[-1].end[2] - found.start[2]) == pytest.approx(np.radians(degrees), abs=np.radians(1))
+
+
+def test_what_has_been_found_when_the_search_ends_is_judged(part):
+    """The twelfth configuration's moves reach the goal; two more would be expanded before it had its turn."""
+    found = wa.plan(part, by={"phi": -0.1}, count=1, max_nodes=12)
+    assert found.nodes == 12
+    assert found.found
 
 
 def test_an_unreachable_goal_names_the_nearest_pose(part):

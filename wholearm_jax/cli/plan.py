@@ -39,7 +39,7 @@ def plan(
     tolerance: Annotated[str | None, typer.Option(help='Such as "x=0.001,phi=1 deg", which is the default.')] = None,
     margin: Annotated[float, typer.Option(help="Least margin of compressive force that a plan must allow [N].")] = 0.0,
     count: Annotated[int, typer.Option(min=1, help="Number of plans at most.")] = 3,
-    phases: Annotated[int | None, typer.Option(min=1, help="Longest plan: 5 phases, with regrasps 24.")] = None,
+    phases: Annotated[int, typer.Option(min=1, help="Longest plan.")] = 24,
     time: Annotated[float, typer.Option(min=0.0, help="Seconds after which the search ends with what it has.")] = 60.0,
     rolling: Annotated[bool, typer.Option(help="Whether contacts may roll.")] = True,
     regrasp_cost: Annotated[float | None, typer.Option(min=0.0, help=REGRASP_HELP)] = None,

@@ -1,10 +1,11 @@
 r"""Search from a configuration to a goal, over the moves between contact formations.
 
 Nodes are configurations; moves lead from one to the next (`moves_from`). A move may be left at its path's end, where a
-coordinate of the goal has its value, or at a few places between, from where others may begin. The search is best-first
-by the number of phases and an estimate of those still needed, and drops moves whose margin is below the floor. With
-regrasps, where plans are long, the estimate weighs more: the search goes for a plan rather than the shortest. A plan
-that it finds is traced anew, at full resolution, and judged by its certificate: the least upper bound of its phases.
+coordinate of the goal has its value, or at a few places between, from where others may begin. The search is best-first,
+by the number of phases and an estimate of those still needed, and drops moves whose margin is below the floor. Two
+orders take turns: by their sum, for plans of up to `SHORT_PLAN` phases, and with more weight on the estimate, which
+goes for a plan of any length. A plan that is found is traced anew, at full resolution, and judged by its certificate:
+the least upper bound of its phases.
 Once there are as many plans as wanted, the floor rises to the least certificate among them, so that from then on only
 better ones count; the search ends when it has gone on as long again without finding one.
 """
@@ -39,8 +40,8 @@ from wholearm_jax.planning.successors import touching_contacts
 STOPS = (1 / 3, 2 / 3)  # fractions of a path at which other moves may begin
 MERGE_TOL = 1e-5  # configurations closer than this, in object radii and radians, are one node
 TYPICAL_SHIFT, TYPICAL_TURN = 0.5, 0.5  # of one move [object radii, rad], for the estimate of phases to come
-REGRASPING_WEIGHT = 3.0  # of that estimate where fingers may regrasp
-LONGEST_PLAN, LONGEST_REGRASPING_PLAN = 5, 24  # phases
+SHORT_PLAN = 5  # phases
+ESTIMATE_WEIGHT = 3.0  # in the order for longer plans
 SEARCH_PATIENCE = 1.0  # nodes without a better plan, over those up to the last one,
 LEAST_PATIENCE = 20  # and at least so many
 
@@ -59,7 +60,8 @@ class _Search:
     count: int
     rolling: bool
     regrasp_cost: float | None
-    queue: list[Any] = field(default_factory=list)
+    queues: tuple[list[Any], list[Any]] = field(default_factory=lambda: ([], []))  # for short plans, for longer ones
+    taken: set[int] = field(default_factory=set)  # numbers of the entries that have left one of them
     visited: set[tuple[int, ...]] = field(default_factory=set)
     order: Any = field(default_factory=itertools.count)
     nearest: tuple[float, tuple[Step, ...]] = (np.inf, ())
@@ -78,7 +80,7 @@ def plan(
     tolerance: Mapping[str, float] | None = None,
     margin: float = 0.0,
     count: int = 3,
-    max_phases: int | None = None,
+    max_phases: int = 24,
     rolling: bool = True,
     regrasp_cost: float | None = None,
     time_limit: float = 60.0,
@@ -95,7 +97,7 @@ def plan(
         tolerance: distances from the goal that are good enough; 1 mm and 1 degree unless given.
         margin: least margin [N] that a plan must allow.
         count: number of plans to return at most.
-        max_phases: longest plan; 5 unless given, with regrasps 24.
+        max_phases: longest plan.
         rolling: whether contacts may roll.
         regrasp_cost: allow regrasps: a finger may leave the object, stand still away from it while the other one moves
             the object, and touch it again. Each time that a finger moves alone counts as so many phases more. None: no
@@ -123,7 +125,7 @@ def plan(
         goal=make_goal(start, goal, by=by, tolerance=tolerance),
         floor=margin,
         radius=float(np.hypot(*np.asarray(rigid_body(scene.object).vertices).T).max()),
-        max_phases=max_phases or (LONGEST_PLAN if regrasp_cost is None else LONGEST_REGRASPING_PLAN),
+        max_phases=max_phases,
         duration=duration,
         count=count,
         rolling=rolling,
@@ -159,14 +161,11 @@ def _run(
 ) -> bool:
     """Expand configurations until nothing is left, plans no longer get better, or time is out; say whether it is."""
     begin = time.monotonic()
-    while search.queue:
-        _, _, z, steps, names = heapq.heappop(search.queue)
+    for z, steps, names in _next_entries(search):
         if steps and min(step.margin for step in steps) <= search.floor:  # the floor has risen
             continue
         if steps and search.goal.is_reached(z):
             _add_plan(search, steps)
-            continue
-        if len(steps) == search.max_phases:
             continue
         if search.plans and _has_lost_patience(search):
             return False
@@ -181,12 +180,26 @@ def _run(
     return False
 
 
+def _next_entries(search: _Search) -> Iterator[tuple[np.ndarray, tuple[Step, ...], tuple[str, ...] | None]]:
+    """Take entries from the two queues in turn, each entry once, until both are empty."""
+    for queue in itertools.cycle(search.queues):
+        while queue:
+            _, number, *entry = heapq.heappop(queue)
+            if number not in search.taken:
+                search.taken.add(number)
+                yield tuple(entry)
+                break
+        if not any(search.queues):
+            return
+
+
 def _add_waiting_plans(search: _Search) -> None:
     """Add plans that have been found but not judged, those of fewest phases first, until there are enough."""
-    for _, _, z, steps, _ in sorted(search.queue):
+    waiting = {number: (z, steps) for queue in search.queues for _, number, z, steps, _ in queue}
+    for number, (z, steps) in sorted(waiting.items(), key=lambda entry: (_cost(search, entry[1][1]), entry[0])):
         if len(search.plans) == search.count:
             return
-        if steps and search.goal.is_reached(z):
+        if number not in search.taken and steps and search.goal.is_reached(z):
             _add_plan(search, steps)
 
 
@@ -213,7 +226,7 @@ def _add_plan(search: _Search, steps: tuple[Step, ...]) -> None:
 
 
 def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tuple[str, ...] | None) -> None:
-    """Add a configuration to the queue unless it is there already."""
+    """Add a configuration to the queues unless it is there already, or no plan may go on from it."""
     unit = np.array([search.radius, search.radius, 1, 1, 1])
     key = tuple(np.round(z / unit / MERGE_TOL).astype(int).tolist())
     if key in search.visited and not search.goal.is_reached(z):  # other ways to the goal are other plans
@@ -222,8 +235,12 @@ def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tup
     distance = _phases_to_go(search, z)
     if distance < search.nearest[0] - 1e-9:
         search.nearest = (distance, steps)
-    weight = 1.0 if search.regrasp_cost is None else REGRASPING_WEIGHT
-    heapq.heappush(search.queue, (_cost(search, steps) + weight * distance, next(search.order), z, steps, touching))
+    entry, arrived = (next(search.order), z, steps, touching), search.goal.is_reached(z)
+    short, long = search.queues
+    if len(steps) < min(SHORT_PLAN, search.max_phases) or arrived:
+        heapq.heappush(short, (_cost(search, steps) + distance, *entry))
+    if search.max_phases > SHORT_PLAN and (len(steps) < search.max_phases or arrived):
+        heapq.heappush(long, (_cost(search, steps) + ESTIMATE_WEIGHT * distance, *entry))
 
 
 def _cost(search: _Search, steps: tuple[Step, ...]) -> float:
