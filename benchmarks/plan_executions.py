@@ -1,22 +1,23 @@
 """Do planned motions work? Goals on random parts, planned, optimised and executed by free bodies in MuJoCo.
 
-    python benchmarks/plan_executions.py [--plans 50] [--regrasps 50] [--seconds 4] [--quick]
+    python benchmarks/plan_executions.py [--plans 50] [--regrasps 50] [--tumbling] [--seconds 4] [--quick]
 
 Parts, hands and goals are those of `planning.py`, turns by 45 to 90 degrees with regrasps; each part on each hand is
-asked one goal after the other. The best plan that is found is optimised, each phase in a second, and executed at the
-default time step: open loop, and where that does not succeed, as where errors grow along a path, under the law of
+asked one goal after the other; with `--tumbling` the bundled heptagon and hexagon are to turn by 90 and 180 degrees,
+either way, with a minute for each. The best plan that is found is optimised, each phase in a second, and executed at
+the default time step: open loop, and where that does not succeed, as where errors grow along a path, under the law of
 `wholearm optimise --feedback` for the largest range of friction that it holds (20, 10, 5 % or the nominal one), at
 1 kHz, 1 ms late, with encoders of 4096 counts and 1 % of torque noise. An execution succeeds within 0.5 mm and
 0.01 rad of the predicted end, the last contacts closed and no link met that should not be.
-Prints and writes how many plans are optimised, how many executions succeed, and what became of the others; with
-`--plans 0` or `--regrasps 0` the results of that kind stay as they are kept.
+Prints and writes how many plans are optimised, how many executions succeed, and what became of the others; results of
+a kind that is not run stay as they are kept.
 """
 
 import argparse
+import itertools
 import time
 from collections import Counter
-from collections.abc import Iterator
-from itertools import islice
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from measure import kept, save
@@ -29,6 +30,7 @@ from wholearm_jax.execution import ExecutionOutcome, Hardware, execute
 
 TURNS = {f"turn {a} deg": {"phi": -np.radians(a)} for a in (45, 60, 75, 90)}
 REGRASP_COST = 1.0
+SECONDS_TO_TUMBLE = 60.0
 FRICTION = (0.2, 0.1, 0.05, 0.0)  # half widths that a law is designed for, the largest that it holds
 
 
@@ -47,6 +49,18 @@ def plans(seconds: float, seed: int, regrasp_cost: float | None) -> Iterator[tup
                     plan = result.plans[0]
                     about = {"kind": kind, "hand": hand, "goal": goal, "bound": plan.bound, "phases": len(plan.steps)}
                     yield about, plan.scene
+
+
+def tumbles(seconds: float) -> Iterator[tuple[dict, wa.Scene | None]]:
+    """Yield plans that turn the bundled objects by 90 and 180 degrees; None where there is none."""
+    for name, degrees in itertools.product(("heptagon", "hexagon"), (-90, 90, -180, 180)):
+        result = wa.plan(wa.load(name), by={"phi": np.radians(degrees)}, count=1, time_limit=seconds)
+        about = {"kind": name, "hand": "its own", "goal": f"turn {degrees} deg"}
+        if result.found:
+            plan = result.plans[0]
+            yield about | {"bound": plan.bound, "phases": len(plan.steps)}, plan.scene
+        else:
+            yield about | {"status": "no plan", "message": result.reason}, None
 
 
 def design(scene: wa.Scene, schedule: wa.TorqueSchedule) -> tuple[float, wa.Controller]:
@@ -86,11 +100,11 @@ def carry_out(scene: wa.Scene) -> dict:
     }
 
 
-def measure(count: int, seconds: float, seed: int, regrasp_cost: float | None) -> list[dict]:
-    """Carry out so many plans."""
+def measure(planned: Iterable[tuple[dict, wa.Scene | None]]) -> list[dict]:
+    """Carry out plans."""
     rows = []
-    for about, scene in islice(plans(seconds, seed, regrasp_cost), count):
-        rows.append(about | carry_out(scene))
+    for about, scene in planned:
+        rows.append(about if scene is None else about | carry_out(scene))
         row = rows[-1]
         print(
             f"{row['kind']}, {row['hand']}, {row['goal']}: open loop {row.get('open_loop', 'none')};"
@@ -120,6 +134,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--plans", type=int, default=50, help="without regrasps")
     parser.add_argument("--regrasps", type=int, default=50, help="plans with regrasps")
+    parser.add_argument("--tumbling", action="store_true", help="turn the bundled objects by 90 and 180 degrees, too")
     parser.add_argument("--seconds", type=float, default=4.0, help="to plan for each goal")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quick", action="store_true", help="one plan, half a second; nothing is written")
@@ -127,11 +142,14 @@ def main() -> None:
     counts = {"without regrasps": (given.plans, None), "with regrasps": (given.regrasps, REGRASP_COST)}
     if given.quick:
         counts = {"without regrasps": (1, None)}
+    seconds = 0.5 if given.quick else given.seconds
     found = {
-        label: measure(count, 0.5 if given.quick else given.seconds, given.seed, cost)
+        label: measure(itertools.islice(plans(seconds, given.seed, cost), count))
         for label, (count, cost) in counts.items()
         if count
     }
+    if given.tumbling:
+        found["tumbling"] = measure(tumbles(SECONDS_TO_TUMBLE))
     for label, rows in found.items():
         report(label, rows)
     if not given.quick:

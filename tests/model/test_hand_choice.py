@@ -5,7 +5,7 @@ import pytest
 import shapely
 from shapely import affinity
 
-from wholearm_jax.model import choose_hand, polygon, resting_configuration, resting_edges
+from wholearm_jax.model import choose_hand, edge_on_palm, polygon, resting_configuration, resting_edges
 
 PARTS = {
     "box": [(0, 0), (60, 0), (60, 40), (0, 40)],
@@ -59,14 +59,32 @@ def test_a_part_stands_on_the_edge_that_is_asked_for():
     assert standing.edge == 1
     assert (standing.width, standing.height) == pytest.approx((0.04, 0.06))
     bracket = polygon(1e-3 * np.array(PARTS["bracket"], float), 0.1, 0.1)
-    with pytest.raises(ValueError, match=r"lies at rest on e0, .*not on e2"):  # the notch's floor
-        choose_hand(bracket, edge=2)
+    with pytest.raises(ValueError, match=r"lies at rest on e0, .*not on e3"):  # in the notch
+        choose_hand(bracket, edge=3)
 
 
-def test_a_part_that_lies_on_no_edge_is_refused():
-    """A star of five points stands on two of them."""
+def test_a_part_that_is_not_convex_stands_on_two_of_its_vertices():
+    """A star on any two neighbouring points: its tipping angle is a fifth of a half turn."""
     angles = np.pi / 5 * np.arange(10)
     radii = np.where(np.arange(10) % 2, 0.012, 0.03)[:, None]
     star = radii * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    with pytest.raises(ValueError, match="none of its edges"):
-        choose_hand(polygon(star, 0.1, 0.1))
+    edges = resting_edges(star)
+    assert sorted(edge for edge, _ in edges) == [0, 2, 4, 6, 8]
+    half, height = 0.03 * np.sin(np.pi / 5), 0.03 * np.cos(np.pi / 5)
+    np.testing.assert_allclose([angle for _, angle in edges], np.arctan2(half, height))
+    choice = choose_hand(polygon(star, 0.1, 0.1), edge=4)
+    z = resting_configuration(polygon(star, 0.1, 0.1), choice.hand, choice.edge, choice.x)
+    placed = affinity.rotate(shapely.Polygon(star), z[2], (0, 0), use_radians=True)
+    assert -placed.bounds[1] == pytest.approx(height) == pytest.approx(z[1])
+    assert choice.width == pytest.approx(placed.bounds[2] - placed.bounds[0])
+
+
+def test_an_arch_stands_on_two_feet():
+    arch = np.array([(0, 0), (12, 0), (12, 20), (48, 20), (48, 0), (60, 0), (60, 40), (0, 40)], float) / 1e3
+    about_centre = arch - shapely.Polygon(arch).centroid.coords[0]
+    assert sorted(edge for edge, _ in resting_edges(about_centre)) == [0, 5, 6, 7]
+    shape = polygon(arch, 0.1, 0.1)
+    choice = choose_hand(shape, edge=0)
+    z = resting_configuration(shape, choice.hand, 0, choice.x)
+    assert z[2] == pytest.approx(0.0)
+    assert edge_on_palm(shape, z) == 0

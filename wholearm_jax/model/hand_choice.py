@@ -48,14 +48,11 @@ def choose_hand(shape: Polygon, edge: int | None = None) -> HandChoice:
         edge: number of the edge to begin on; None: the steadiest on which a hand closes on the object.
 
     Raises:
-        ValueError: if the object can rest on none of its edges, or not on that one, or no hand of the design closes on
-            it.
+        ValueError: if the object cannot rest on that edge, or no hand of the design closes on it.
     """
     body = rigid_body(shape)
     corners = np.asarray(body.vertices)[: int(body.count)]
     edges = resting_edges(corners)
-    if not edges:
-        raise ValueError("the object can lie at rest on none of its edges")
     allowed = [row for row in edges if edge is None or row[0] == edge]
     if not allowed:
         raise ValueError(f"the object lies at rest on {', '.join(f'e{k}' for k, _ in sorted(edges))}, not on e{edge}")
@@ -72,20 +69,22 @@ def choose_hand(shape: Polygon, edge: int | None = None) -> HandChoice:
 
 
 def resting_edges(corners: Float[np.ndarray, "count 2"]) -> list[tuple[int, float]]:
-    """List the edges on which a polygon lies at rest, the steadiest first.
+    """List the edges of its convex hull on which a polygon lies at rest, the steadiest first.
 
     Args:
         corners: vertices about the centre of mass [m].
 
     Returns:
-        Each edge with the angle [rad] by which the object may be turned over either of its ends before it tips.
+        Each edge, named after its first vertex, with the angle [rad] by which the object may be turned over either of
+        its ends before it tips.
     """
     rows = []
     for edge in range(len(corners)):
         at = _laid_down(corners, edge)
-        height = -at[edge, 1]
-        left, right = -at[edge, 0], at[(edge + 1) % len(corners), 0]
-        if at[:, 1].min() >= -height - 1e-9 * np.ptp(corners) and min(left, right) > 0:
+        height, down = -at[edge, 1], np.flatnonzero(at[:, 1] <= at[edge, 1] + 1e-9 * np.ptp(corners))
+        left, right = -at[down, 0].min(), at[down, 0].max()
+        begins = at[edge, 0] <= -left and at[:, 1].min() >= -height - 1e-9 * np.ptp(corners)
+        if begins and min(left, right) > 0:
             rows.append((edge, float(np.arctan2(min(left, right), height))))
     return sorted(rows, key=lambda row: (-round(row[1], 9), row[0]))
 

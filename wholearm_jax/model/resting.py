@@ -1,8 +1,15 @@
-"""The configuration in which an object rests on the palm with one edge down and both fingers are closed on it."""
+"""The configuration in which an object rests on the palm with one edge down and both fingers are closed on it.
+
+An edge here is one of the convex hull, named after the vertex at which it begins: a part that is not convex may rest on
+two vertices, or two feet, with a gap between.
+"""
 
 import numpy as np
+from jaxtyping import Float
 
 from wholearm_jax.model.scene import Hand, Polygon, rigid_body
+
+IN_LINE_TOL = 1e-9  # [rad], within which vertices are in line
 
 
 def resting_configuration(shape: Polygon, hand: Hand, edge: int, x: float) -> np.ndarray:
@@ -11,7 +18,7 @@ def resting_configuration(shape: Polygon, hand: Hand, edge: int, x: float) -> np
     Args:
         shape: the object.
         hand: the hand.
-        edge: the edge that lies on the palm, from vertex `edge` to the next.
+        edge: the edge that lies on the palm, from vertex `edge` to the next of the convex hull.
         x: the centre of mass's x [m].
 
     Returns:
@@ -46,8 +53,22 @@ def resting_angle(corners: np.ndarray, edge: int) -> float:
     count = len(corners)
     if not 0 <= edge < count:
         raise ValueError(f"e{edge}: the object has edges 0 to {count - 1}")
-    along = corners[(edge + 1) % count] - corners[edge]
+    along = corners[_last_vertex(corners, edge)] - corners[edge]
     return -float(np.arctan2(along[1], along[0]))
+
+
+def _last_vertex(corners: Float[np.ndarray, "count 2"], edge: int) -> int:
+    """Return the vertex at which the edge of a polygon's convex hull ends that begins at vertex `edge`.
+
+    Seen from there it is the outermost to the right, of several in line the farthest. Where the hull has no such
+    vertex, other vertices lie outside of the edge that is found.
+    """
+    to = corners - corners[edge]
+    along = to[(edge + 1) % len(corners)]
+    angle = np.arctan2(along[0] * to[:, 1] - along[1] * to[:, 0], to @ along)
+    angle[edge] = np.inf
+    in_line = np.flatnonzero(angle <= angle.min() + IN_LINE_TOL)
+    return int(in_line[np.argmax(np.hypot(*to[in_line].T))])
 
 
 def edge_on_palm(shape: Polygon, z: np.ndarray) -> int:
@@ -59,11 +80,11 @@ def edge_on_palm(shape: Polygon, z: np.ndarray) -> int:
     body = rigid_body(shape)
     corners = np.asarray(body.vertices)[: int(body.count)]
     heights = z[1] + np.sin(z[2]) * corners[:, 0] + np.cos(z[2]) * corners[:, 1]
-    on_palm = np.abs(heights) <= 1e-6 * np.ptp(corners)
-    edges = np.flatnonzero(on_palm & np.roll(on_palm, -1))
-    if not len(edges):
+    on_palm = np.flatnonzero(np.abs(heights) <= 1e-6 * np.ptp(corners))
+    if len(on_palm) < 2:
         raise ValueError("start: the object does not lie on an edge")
-    return int(edges[0])
+    across = np.cos(z[2]) * corners[on_palm, 0] - np.sin(z[2]) * corners[on_palm, 1]
+    return int(on_palm[np.argmin(across)])
 
 
 def _closing_angle(corners: np.ndarray, hand: Hand, finger: int) -> float | None:
