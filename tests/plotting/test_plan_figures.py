@@ -1,5 +1,6 @@
 """Figures: drawn on the axes given or on new ones, returned, with what the result says; a paper's settings."""
 
+import equinox as eqx
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
@@ -11,8 +12,8 @@ from wholearm_jax.model.schedule import torque_schedule
 from wholearm_jax.phases.plan_simulation import simulate
 from wholearm_jax.plotting.palette import CONTACT_COLOURS, DASHES, contact_styles
 from wholearm_jax.plotting.plan_figures import plot_forces, plot_result, plot_torques
-from wholearm_jax.plotting.pose_figures import plot_pose, plot_strip
-from wholearm_jax.plotting.style import COLUMN, PAPER
+from wholearm_jax.plotting.pose_figures import plot_plan_poses, plot_pose, plot_strip
+from wholearm_jax.plotting.style import COLUMN, PAPER, format_time_axis
 
 mpl.use("agg")
 
@@ -63,6 +64,26 @@ def test_forces_show_the_margin_and_every_contact(pushed):
 def test_pose_numbers_its_vertices(pushed):
     ax = plot_pose(pushed.scene, pushed.phases[0].traced.begin, numbers=True)
     assert [text.get_text() for text in ax.texts] == [str(k) for k in range(7)]
+
+
+def test_phases_are_numbered_where_their_names_do_not_fit(pushed):
+    names = [phase.name for phase in pushed.phases]
+    for width, labels in ((10.0, names), (0.4, ["1"])):
+        ax = plt.figure(figsize=(width, 2.0)).add_subplot()
+        format_time_axis(ax, pushed)
+        assert [text.get_text() for text in ax.texts] == labels
+        plt.close()
+
+
+def test_poses_of_a_long_plan_stand_in_rows(pushed):
+    z = np.asarray(pushed.scene.start)
+    long = eqx.tree_at(lambda scene: scene.phases, pushed.scene, pushed.scene.phases[:1] * 6)
+    axes = plot_plan_poses(long, [z] * 6, [z] * 6)
+    assert axes.shape == (2, 5)
+    assert [bool(ax.title.get_text()) for ax in axes.flat] == [True] * 7 + [False] * 3
+    width, height = axes[0, 0].figure.get_size_inches()
+    assert width > height
+    plt.close()
 
 
 def test_settings_of_a_paper(pushed):

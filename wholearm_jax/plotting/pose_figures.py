@@ -12,7 +12,9 @@ from shapely import Polygon as ShapelyPolygon
 from wholearm_jax.model import Scene, rigid_body
 from wholearm_jax.phases import Result, describe_overlaps, trajectory
 from wholearm_jax.plotting.palette import LINK_COLOURS as COLOURS
-from wholearm_jax.plotting.style import ALARM, FILL, INK, PAGE, PALE
+from wholearm_jax.plotting.style import ALARM, FILL, INK, PAGE, PALE, whole_figure
+
+POSES_IN_ROW = 5
 
 
 def plot_pose(
@@ -26,7 +28,7 @@ def plot_pose(
     z = np.asarray(z)
     outline = object_outline(scene, z)
     joints, lengths, offsets = (np.asarray(a) for a in (scene.hand.joint, scene.hand.length, scene.hand.offset))
-    ax.plot(joints[::-1, 0], [0, 0], color=INK, lw=2.5, solid_capstyle="butt")
+    ax.plot(joints[::-1, 0], [0, 0], color=INK, lw=2.5, solid_capstyle="butt", clip_on=False)
     ax.add_patch(Patch(outline, closed=True, facecolor=FILL, edgecolor=INK, lw=1.0, joinstyle="round"))
     segments = []
     for k, (joint, side) in enumerate(zip(joints, (1, -1), strict=True)):
@@ -35,7 +37,7 @@ def plot_pose(
         ends = np.stack([base, base + lengths[k] * direction])
         segments.append(ends)
         ax.plot(*ends.T, color=COLOURS[k], lw=2.5, solid_capstyle="round")
-        ax.plot(*joint, "o", color=COLOURS[k], ms=4)
+        ax.plot(*joint, "o", color=COLOURS[k], ms=4, clip_on=False)
     _mark_overlaps(scene, z, outline, segments, ax, tolerance)
     ax.plot(z[0], z[1], "+", color=INK, ms=5)
     if numbers:
@@ -54,7 +56,7 @@ def plot_strip(result: Result, poses: int = 4, axes=None) -> np.ndarray:
 
     Takes and returns a `(phases, poses)` array of axes.
     """
-    motions = trajectory(result)
+    motions, given = trajectory(result), axes
     axes = pose_grid(axes, max(len(motions), 1), poses, 0.95)
     for row, (phase, motion) in enumerate(zip(result.phases, motions, strict=False)):
         shown = np.linspace(0, len(motion.time) - 1, axes.shape[1]).round().astype(int)
@@ -67,6 +69,8 @@ def plot_strip(result: Result, poses: int = 4, axes=None) -> np.ndarray:
         plot_pose(result.scene, result.scene.start, axes[0, 0], label=result.status.label)
         for ax in axes[0, 1:]:
             ax.axis("off")
+    if given is None:
+        _fit_height(axes, lines=1)
     return axes
 
 
@@ -122,14 +126,28 @@ def plot_plan_poses(scene: Scene, begins, ends, axes=None) -> np.ndarray:
     Returns:
         The axes.
     """
-    axes = pose_grid(axes, 1, len(ends) + 1, 1.15)
-    plot_pose(scene, begins[0], axes.flat[0], label="start", numbers=True)
+    given, columns = axes, min(len(ends) + 1, POSES_IN_ROW)
+    axes = pose_grid(axes, -(-(len(ends) + 1) // columns), columns, 1.15)
+    for ax in axes.flat[len(ends) + 1 :]:
+        ax.axis("off")
+    plot_pose(scene, begins[0], axes.flat[0], label="start", numbers=True).title.set_fontsize("x-small")
     for k, (ax, begin, end) in enumerate(zip(axes.flat[1:], begins, ends, strict=False)):
         _plot_start_outline(scene, begin, ax)
         contacts = scene.phases[k].formation.names
         plot_pose(scene, end, ax, label=f"{k + 1}: {' '.join(contacts[:2])}\n{' '.join(contacts[2:])}")
         ax.title.set_fontsize("x-small")
+    if given is None:
+        _fit_height(axes, lines=2)
     return axes
+
+
+def _fit_height(axes: np.ndarray, lines: int) -> None:
+    """Make a figure as high as its poses and `lines` of title above each row of them."""
+    (left, right), (low, high) = axes.flat[0].get_xlim(), axes.flat[0].get_ylim()
+    rows, columns = axes.shape
+    title = (1.5 * lines + 1) * axes.flat[0].title.get_fontsize() / 72
+    height = PAGE / columns * (high - low) / (right - left) + title
+    whole_figure(axes.flat[0]).set_size_inches(PAGE, rows * height)
 
 
 def pose_grid(axes, rows: int, columns: int, ratio: float) -> np.ndarray:

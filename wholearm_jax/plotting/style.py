@@ -5,11 +5,12 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.transforms import ScaledTranslation
 
 from wholearm_jax.core import write_atomically
@@ -41,6 +42,8 @@ Figures are then `COLUMN` or `PAGE` inches wide, with letters of 7 and 8 points.
 
 INK, FILL, PALE = "#222222", "#E8EEF4", "#999999"
 ALARM = "#CC0000"  # what cannot be
+AXES_SHARE = 0.8  # width of an axis over the figure's, about
+LETTER_SHARE = 0.5  # width of a letter over its size, about
 
 
 def save_figure(draw: Callable[[], Any], folder: Path, name: str) -> None:
@@ -63,16 +66,29 @@ def dash_style(number: int):
 
 def format_time_axis(ax: Axes, result: Result, *, named: bool = True, zero: bool = True) -> None:
     """Format an axis of time: its label, the phases, and its frame."""
-    for phase in result.phases:
+    for phase, label in zip(result.phases, _phase_labels(ax, result), strict=True):
         ax.axvline(phase.start, color=PALE, lw=0.6, ls=":")
         middle, transform = phase.start + phase.duration / 2, ax.get_xaxis_transform()
         if named:
-            ax.text(middle, 1.01, phase.name, transform=transform, ha="center", va="bottom", style="italic")
+            ax.text(middle, 1.01, label, transform=transform, ha="center", va="bottom", style="italic")
     if zero:
         ax.axhline(0, color=INK, lw=0.6)
     ax.set_xlim(0, result.phases[-1].start + result.phases[-1].duration)
     ax.set_xlabel("time $t$ [s]")
     ax.spines[["top", "right"]].set_visible(False)
+
+
+def whole_figure(ax: Axes) -> Figure:
+    """Return the figure that an axis is part of."""
+    return cast(Figure, ax.get_figure(root=True))
+
+
+def _phase_labels(ax: Axes, result: Result) -> list[str]:
+    """Return the phases' names, or their numbers where a name is wider than its phase."""
+    whole = sum(phase.duration for phase in result.phases)
+    letters = 72 * whole_figure(ax).get_figwidth() * AXES_SHARE / (LETTER_SHARE * plt.rcParams["font.size"])
+    fit = all(len(phase.name) <= letters * phase.duration / whole for phase in result.phases)
+    return [phase.name if fit else str(k) for k, phase in enumerate(result.phases, 1)]
 
 
 def add_legend_below(ax: Axes, columns: int) -> Axes:
