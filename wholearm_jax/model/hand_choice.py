@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from wholearm_jax.core import as_device_array
 from wholearm_jax.model.hand_collisions import link_overlaps
-from wholearm_jax.model.resting import resting_angle, resting_configuration
+from wholearm_jax.model.resting import hull_edges, lying_angle, resting_angle, resting_configuration
 from wholearm_jax.model.scene import Hand, Polygon, rigid_body
 
 GRAVITY = 9.81  # [m/s^2], of the loads that the joints are made for
@@ -57,7 +57,7 @@ def choose_hand(shape: Polygon, edge: int | None = None) -> HandChoice:
     if not allowed:
         raise ValueError(f"the object lies at rest on {', '.join(f'e{k}' for k, _ in sorted(edges))}, not on e{edge}")
     for clearance, (on, tipping_angle) in itertools.product(CLEARANCE, allowed):
-        at = _laid_down(corners, on)
+        at = _rotated(corners, resting_angle(corners, on))
         width, height = np.ptp(at, axis=0).tolist()
         x = round(-(at[:, 0].min() + at[:, 0].max()) / 2, _DIGITS) + 0.0
         for span, reach in itertools.product(SPAN, REACH):
@@ -79,12 +79,11 @@ def resting_edges(corners: Float[np.ndarray, "count 2"]) -> list[tuple[int, floa
         its ends before it tips.
     """
     rows = []
-    for edge in range(len(corners)):
-        at = _laid_down(corners, edge)
+    for edge, last in hull_edges(corners).items():
+        at = _rotated(corners, lying_angle(corners, edge, last))
         height, down = -at[edge, 1], np.flatnonzero(at[:, 1] <= at[edge, 1] + 1e-9 * np.ptp(corners))
         left, right = -at[down, 0].min(), at[down, 0].max()
-        begins = at[edge, 0] <= -left and at[:, 1].min() >= -height - 1e-9 * np.ptp(corners)
-        if begins and min(left, right) > 0:
+        if at[edge, 0] <= -left and min(left, right) > 0:  # of sides that rounding splits, the first
             rows.append((edge, float(np.arctan2(min(left, right), height))))
     return sorted(rows, key=lambda row: (-round(row[1], 9), row[0]))
 
@@ -117,9 +116,8 @@ def scaled_hand(span: float, length: float, mass: float) -> Hand:
     )
 
 
-def _laid_down(corners: np.ndarray, edge: int) -> np.ndarray:
-    """Turn a polygon about its centre of mass so that an edge lies down."""
-    phi = resting_angle(corners, edge)
+def _rotated(corners: np.ndarray, phi: float) -> np.ndarray:
+    """Turn a polygon about its centre of mass."""
     turn = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]])
     return corners @ turn.T
 

@@ -4,12 +4,13 @@ An edge here is one of the convex hull, named after the vertex at which it begin
 two vertices, or two feet, with a gap between.
 """
 
+import itertools
+
 import numpy as np
+import shapely
 from jaxtyping import Float
 
 from wholearm_jax.model.scene import Hand, Polygon, rigid_body
-
-IN_LINE_TOL = 1e-9  # [rad], within which vertices are in line
 
 
 def resting_configuration(shape: Polygon, hand: Hand, edge: int, x: float) -> np.ndarray:
@@ -53,22 +54,22 @@ def resting_angle(corners: np.ndarray, edge: int) -> float:
     count = len(corners)
     if not 0 <= edge < count:
         raise ValueError(f"e{edge}: the object has edges 0 to {count - 1}")
-    along = corners[_last_vertex(corners, edge)] - corners[edge]
+    return lying_angle(corners, edge, hull_edges(corners).get(edge, (edge + 1) % count))
+
+
+def lying_angle(corners: Float[np.ndarray, "count 2"], first: int, last: int) -> float:
+    """Return the angle `phi` [rad] at which the line from one vertex of a polygon to another lies down on the palm."""
+    along = corners[last] - corners[first]
     return -float(np.arctan2(along[1], along[0]))
 
 
-def _last_vertex(corners: Float[np.ndarray, "count 2"], edge: int) -> int:
-    """Return the vertex at which the edge of a polygon's convex hull ends that begins at vertex `edge`.
-
-    Seen from there it is the outermost to the right, of several in line the farthest. Where the hull has no such
-    vertex, other vertices lie outside of the edge that is found.
-    """
-    to = corners - corners[edge]
-    along = to[(edge + 1) % len(corners)]
-    angle = np.arctan2(along[0] * to[:, 1] - along[1] * to[:, 0], to @ along)
-    angle[edge] = np.inf
-    in_line = np.flatnonzero(angle <= angle.min() + IN_LINE_TOL)
-    return int(in_line[np.argmax(np.hypot(*to[in_line].T))])
+def hull_edges(corners: Float[np.ndarray, "count 2"]) -> dict[int, int]:
+    """Return the edges of a polygon's convex hull: the last vertex of each, by the first."""
+    ring = shapely.get_coordinates(shapely.MultiPoint(corners).convex_hull)
+    if not shapely.is_ccw(shapely.linearrings(ring)):
+        ring = ring[::-1]
+    number = {tuple(corner): k for k, corner in enumerate(corners.tolist())}
+    return {number[first]: number[last] for first, last in itertools.pairwise(map(tuple, ring.tolist()))}
 
 
 def edge_on_palm(shape: Polygon, z: np.ndarray) -> int:

@@ -229,14 +229,14 @@ def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tup
     """Add a configuration to the queues unless it is there already, or no plan may go on from it."""
     unit = np.array([search.radius, search.radius, 1, 1, 1])
     key = tuple(np.round(z / unit / MERGE_TOL).astype(int).tolist())
-    if key in search.visited and not search.goal.is_reached(z):  # other ways to the goal are other plans
+    arrived = search.goal.is_reached(z)
+    if key in search.visited and not arrived:  # other ways to the goal are other plans
         return
     search.visited.add(key)
     distance = _phases_to_go(search, z)
     if distance < search.nearest[0] - 1e-9:
         search.nearest = (distance, steps)
-    entry, arrived = (next(search.order), z, steps, touching), search.goal.is_reached(z)
-    short, long = search.queues
+    entry, (short, long) = (next(search.order), z, steps, touching), search.queues
     if len(steps) < min(SHORT_PLAN, search.max_phases) or arrived:
         heapq.heappush(short, (_cost(search, steps) + distance, *entry))
     if search.max_phases > SHORT_PLAN and (len(steps) < search.max_phases or arrived):
