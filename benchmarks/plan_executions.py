@@ -2,13 +2,14 @@
 
     python benchmarks/plan_executions.py [--plans 50] [--regrasps 50] [--tumbling] [--seconds 4] [--quick]
 
-Parts, hands and goals are those of `planning.py`, turns by 45 to 90 degrees with regrasps; each part on each hand is
-asked one goal after the other; with `--tumbling` the bundled heptagon and hexagon are to turn by 90 and 180 degrees,
-either way, with a minute for each. The best plan that is found is optimised, each phase in a second, and executed at
-the default time step: open loop, and where that does not succeed, as where errors grow along a path, under the law of
-`wholearm optimise --feedback` for the largest range of friction that it holds (20, 10, 5 % or the nominal one), at
-1 kHz, 1 ms late, with encoders of 4096 counts and 1 % of torque noise. An execution succeeds within 0.5 mm and
-0.01 rad of the predicted end, the last contacts closed and no link met that should not be.
+Parts, hands and goals are those of `planning.py`; with regrasps, turns by 45 to 90 degrees, and slides after which a
+finger leans 0.8 rad farther over the object, from elsewhere. Each part on each hand is asked one goal after the other,
+and of the plans that are found the best with a regrasp is taken; with `--tumbling` the bundled heptagon and hexagon are
+to turn by 90 and 180 degrees, either way, with a minute for each. The best plan is optimised, each phase in a second,
+and executed at the default time step: open loop, and where that does not succeed, as where errors grow along a path,
+under the law of `wholearm optimise --feedback` for the largest range of friction that it holds (20, 10, 5 % or the
+nominal one), at 1 kHz, 1 ms late, with encoders of 4096 counts and 1 % of torque noise. An execution succeeds within
+0.5 mm and 0.01 rad of the predicted end, the last contacts closed and no link met that should not be.
 Prints and writes how many plans are optimised, how many executions succeed, and what became of the others; results of
 a kind that is not run stay as they are kept.
 """
@@ -28,25 +29,28 @@ from wholearm_jax.core import Status
 from wholearm_jax.ensembles import wilson_interval
 from wholearm_jax.execution import ExecutionOutcome, Hardware, execute
 
-TURNS = {f"turn {a} deg": {"phi": -np.radians(a)} for a in (45, 60, 75, 90)}
-REGRASP_COST = 1.0
+WITH_REGRASPS = {
+    **{f"turn {a} deg": {"phi": -np.radians(a)} for a in (45, 60, 75, 90)},
+    "slide 20 mm, finger 1 by -0.8 rad": {"x": -0.02, "theta1": -0.8},
+    "slide 20 mm, finger 2 by 0.8 rad": {"x": -0.02, "theta2": 0.8},
+}
 SECONDS_TO_TUMBLE = 60.0
 FRICTION = (0.2, 0.1, 0.05, 0.0)  # half widths that a law is designed for, the largest that it holds
 
 
-def plans(seconds: float, seed: int, regrasp_cost: float | None) -> Iterator[tuple[dict, wa.Scene]]:
-    """Yield plans for one goal after the other, without end; with regrasps, those alone that have one."""
+def plans(seconds: float, seed: int, with_regrasps: bool) -> Iterator[tuple[dict, wa.Scene]]:
+    """Yield plans for one goal after the other, without end."""
     rng = np.random.default_rng(seed)
-    goals = GOALS if regrasp_cost is None else TURNS
+    goals = WITH_REGRASPS if with_regrasps else GOALS
+    options = {"count": 3, "regrasp_cost": 0.0} if with_regrasps else {"count": 1}
     while True:
         for kind, shape in objects(rng, 1):
             for hand, (joint, length) in HANDS.items():
                 scene, goal = at_rest(shape, joint, length), str(rng.choice(list(goals)))
                 if scene is None:
                     continue
-                result = wa.plan(scene, by=goals[goal], count=1, time_limit=seconds, regrasp_cost=regrasp_cost)
-                if result.found and (regrasp_cost is None or any(step.regrasp for step in result.plans[0].steps)):
-                    plan = result.plans[0]
+                found = wa.plan(scene, by=goals[goal], time_limit=seconds, **options).plans
+                for plan in [each for each in found if not with_regrasps or any(s.regrasp for s in each.steps)][:1]:
                     about = {"kind": kind, "hand": hand, "goal": goal, "bound": plan.bound, "phases": len(plan.steps)}
                     yield about, plan.scene
 
@@ -139,13 +143,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quick", action="store_true", help="one plan, half a second; nothing is written")
     given = parser.parse_args()
-    counts = {"without regrasps": (given.plans, None), "with regrasps": (given.regrasps, REGRASP_COST)}
+    counts = {"without regrasps": (given.plans, False), "with regrasps": (given.regrasps, True)}
     if given.quick:
-        counts = {"without regrasps": (1, None)}
+        counts = {"without regrasps": (1, False)}
     seconds = 0.5 if given.quick else given.seconds
     found = {
-        label: measure(itertools.islice(plans(seconds, given.seed, cost), count))
-        for label, (count, cost) in counts.items()
+        label: measure(itertools.islice(plans(seconds, given.seed, with_regrasps), count))
+        for label, (count, with_regrasps) in counts.items()
         if count
     }
     if given.tumbling:

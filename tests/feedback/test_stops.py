@@ -58,7 +58,7 @@ def test_the_push_at_a_stop_has_the_largest_margin_of_all_that_move_every_object
     for other in corner_scenes(scene, 0.2, 0.1)[1:4]:
         stops.append(object_at_stop(other, phase, wa.trace(other)[0]))
     torque, limit = np.array([0.3, -0.2]), np.asarray(scene.hand.torque_limit)
-    push, direction = choose_push(stops, torque, limit)
+    push, direction = choose_push(stops, torque, limit, either_finger=True)
 
     def margin(under):
         return min(stop.statics.margin_under(under).margin for stop in stops)

@@ -275,3 +275,17 @@ def test_the_path_can_be_differentiated(data):
     assert float(jax.jit(jax.grad(end))(joint)) == pytest.approx(difference, rel=1e-6)
     assert float(jax.jit(jax.jacfwd(end))(joint)) == pytest.approx(difference, rel=1e-6)
     assert abs(difference) > 0.1
+
+
+def test_a_law_leaves_a_finger_that_is_away_alone(data, optimum):
+    """Such a finger's torque moves nothing else: none at all, so that dry friction keeps the finger where it is."""
+    law = wa.feedback(wa.parse(data), optimum.torque, friction=0.05)
+    opens, pushes, closes = law.phases
+    np.testing.assert_array_equal(pushes.torque[:, 0], 0.0)
+    np.testing.assert_array_equal(pushes.gain[:, 0], 0.0)
+    for phase in (opens, closes):  # and the finger that holds the object does not answer to the other one's place
+        np.testing.assert_array_equal(phase.gain[:, 1], 0.0)
+    execution = execute(optimum.result, controller=law, timestep=1e-3)
+    assert execution.ending is ExecutionOutcome.OK
+    stands = (execution.course.time > 0.6) & (execution.course.time < 1.4)
+    assert np.ptp(execution.course.z[stands, 3]) < 1e-3

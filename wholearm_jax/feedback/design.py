@@ -18,7 +18,7 @@ from wholearm_jax.feedback.reference_motion import (
     smooth_motions,
 )
 from wholearm_jax.feedback.stop_places import draw_shapes, has_paths, stop_places
-from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop
+from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop, stays_at_stop
 from wholearm_jax.feedback.torque_choice import TorqueChoice, choose_torques
 from wholearm_jax.model import Arrival, Scene, TorqueSchedule
 from wholearm_jax.phases import (
@@ -137,7 +137,8 @@ def _approaches(
         if length - slow < speed * (duration - slow / speed):  # it is slow anyway
             slow, speed = 0.0, APPROACH
         stops = phase.arrive is not Arrival.MOVING and ends_at_stop(scene, phase, path)
-        found.append(Approach(slow, speed, max(slow, BEYOND + stop.beyond)) if stops else None)
+        stays = stops and stays_at_stop(object_at_stop(scene, phase, path))
+        found.append(Approach(slow, speed, max(slow, BEYOND + stop.beyond)) if stays else None)
     return found
 
 
@@ -236,7 +237,8 @@ def _phase_law(
     press = 0.0
     if approach is not None:
         stops = [object_at_stop(one, phase, paths[k]) for one, paths in objects if has_paths(paths[: k + 1])]
-        press, gain_at_stop = choose_push(stops, choice.torque[-1], np.asarray(scene.hand.torque_limit))
+        limit, either = np.asarray(scene.hand.torque_limit), not phase.has_free_finger
+        press, gain_at_stop = choose_push(stops, choice.torque[-1], limit, either_finger=either)
         gain[table.s > table.s[-1] - approach.reach] = gain_at_stop
     gain /= (gain * terms.acceleration[:, 3:]).sum(1, keepdims=True)
     return PhaseLaw(

@@ -29,8 +29,18 @@ def object_at_stop(scene: Scene, phase: Phase, path: TracedPhase) -> StopStatics
     return StopStatics(contact_statics(scene, closed, end), terms.acceleration[-1])
 
 
+def stays_at_stop(stop: StopStatics) -> bool:
+    """Return whether an object that is pushed against a stop can stay there.
+
+    It cannot where every torque that moves it there moves it on, as where its edge comes to lie along the one finger
+    that pushes it. Where the torque limits allow no such push it can.
+    """
+    margin = stop.statics.best_against(stop.acceleration[[0, 3, 4]], DECISIVE).margin
+    return margin > 0 or margin == -np.inf
+
+
 def choose_push(
-    stops: list[StopStatics], torque: Float[np.ndarray, "2"], limit: Float[np.ndarray, "2"]
+    stops: list[StopStatics], torque: Float[np.ndarray, "2"], limit: Float[np.ndarray, "2"], *, either_finger: bool
 ) -> tuple[float, Float[np.ndarray, "2"]]:
     """Choose the push with which objects arrive at a stop and stand there.
 
@@ -38,6 +48,7 @@ def choose_push(
         stops: The objects, the nominal one first.
         torque: The reference's last torque [N m].
         limit: The torque limits [N m].
+        either_finger: Whether both fingers may push; else that alone which moves, as the other one is away or holds.
 
     Returns:
         The acceleration [rad/s^2] that the feedback adds at most, and the torques for one of them [N m s^2]. Of all
@@ -46,7 +57,8 @@ def choose_push(
     """
     pull = stops[0].acceleration[3:]
     ahead, across = pull / np.hypot(*pull), np.array([-pull[1], pull[0]]) / np.hypot(*pull)
-    directions = (ahead + np.tan(TURNS)[:, None] * across) / np.hypot(*pull)
+    turns = TURNS if either_finger else np.zeros(1)
+    directions = (ahead + np.tan(turns)[:, None] * across) / np.hypot(*pull)
     pushes = np.linspace(0.0, LARGEST, TRIED)
     torques = (torque + pushes[:, None, None] * directions).reshape(-1, 2)
     moves = np.min([stop.acceleration[0] + torques @ stop.acceleration[3:] for stop in stops], axis=0)
@@ -57,7 +69,7 @@ def choose_push(
         chosen = int(candidates[_largest_margin(stops, torques[candidates])])
     else:
         chosen = int(np.argmax(np.where(within, moves, -np.inf)))
-    push, turn = divmod(chosen, len(TURNS))
+    push, turn = divmod(chosen, len(turns))
     return float(pushes[push]), directions[turn]
 
 

@@ -15,7 +15,7 @@ from wholearm_jax.feedback.path_table import PathTerms
 
 LINE, DIRECTIONS, ZOOMS = 41, 17, 3  # places on the line, directions of the gain, searches
 WIDEST = 1.2  # largest angle between the gain and the direction that accelerates most [rad]
-TORQUE_COST, CORRECTION_COST = 0.02, 1.0  # margin [N] that a torque, and a correction, of 1 N m may cost
+TORQUE_COST, CORRECTION_COST = 0.02, 1.0  # margin [N] that a torque, and a correction, of 1 N m in all may cost
 LEAST_ANSWER = 0.2  # acceleration of the object that answers least to a correction, over the nominal one's
 RIPPLE = 5.0  # correction that measured angles cause by being rounded [rad/s^2]
 
@@ -83,7 +83,7 @@ def _worst(acceleration, slack, limit, speeds, a: float, torque, g):
     forces = free + np.einsum("oft,oxgt->oxgf", slack[:, :, 3:], corrected)
     margin = forces.min((0, 3))
     over = np.maximum(np.abs(corrected) - limit, 0.0).max((0, 3)) + np.where(opposed, np.inf, 0.0)
-    cost = TORQUE_COST * np.abs(torque).max(1)[:, None] + CORRECTION_COST * (RIPPLE + np.abs(alpha).max(0)) * np.abs(
-        g
-    ).max(1)
+    cost = TORQUE_COST * np.hypot(*torque.T)[:, None] + CORRECTION_COST * (RIPPLE + np.abs(alpha).max(0)) * np.hypot(
+        *g.T
+    )
     return np.where(over > 0, -1e3 * (1 + over), margin) - cost, np.where(over > 0, -np.inf, margin)

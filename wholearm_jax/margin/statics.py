@@ -81,6 +81,14 @@ class Statics:
         limits = np.column_stack([-self.torque_limit, self.torque_limit])
         return self._best(limits, NO_ROWS if departure is None else departure.rest_rows())
 
+    def best_against(self, acceleration, least: float) -> StaticMargin:
+        """Compute the largest margin of all torques within limits that give `acceleration @ (1, torque) >= least`.
+
+        It is minus infinity where no torque does.
+        """
+        limits = np.column_stack([-self.torque_limit, self.torque_limit])
+        return self._best(limits, np.array([[least, 0.0, 0.0]]) - acceleration)
+
     def most_central_torque(self, departure: RestAccelerations) -> StaticMargin:
         """Compute a torque with `MARGIN_TIE` of the largest margin, farthest from those that move the object."""
         limits, rest_rows = np.column_stack([-self.torque_limit, self.torque_limit]), departure.rest_rows()
