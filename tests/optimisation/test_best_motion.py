@@ -3,12 +3,17 @@
 from dataclasses import replace
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from support import layered
 
 import wholearm_jax as wa
+from wholearm_jax.margin import rest_to_rest, solve_path
 from wholearm_jax.model import Arrival, replace_duration
+from wholearm_jax.tracing import Resolution
 
 
 def lasting(scene, seconds):
@@ -73,3 +78,36 @@ def test_a_phase_that_may_end_at_any_speed_has_at_least_the_margin():
         lambda s: s.phases, scene, (replace(scene.phases[0], arrive=Arrival.ANY_SPEED), scene.phases[1])
     )
     assert wa.convex_bounds(caught)[0].margin > wa.convex_bounds(scene)[0].margin
+
+
+def quantities(scene, intervals):
+    """Return a function of the scene's floats in one vector, and that vector: largest margin and shortest time."""
+    flat, join = ravel_pytree(eqx.filter(scene, eqx.is_inexact_array))
+    rest = eqx.filter(scene, eqx.is_inexact_array, inverse=True)
+
+    def optimum(numbers, fast):
+        changed = eqx.combine(join(numbers), rest)
+        path = wa.trace(changed, resolution=Resolution(segments=3, panels=8))[0]
+        seconds, margin = jnp.where(fast, jnp.inf, changed.phases[0].duration), jnp.where(fast, 0.2, jnp.nan)
+        best = solve_path(path.dynamics, seconds, margin, rest_to_rest(), intervals)
+        return jnp.where(fast, best.duration, best.margin)
+
+    return optimum, flat
+
+
+@pytest.mark.parametrize("reverse", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_certificate_and_shortest_time_are_differentiable_in_every_float_of_a_scene(reverse):
+    """Along a random direction. Differences trace the path anew and so place nodes a little elsewhere:
+    they carry the derivative of the discretisation's error, which for the time is larger and falls with the intervals.
+    """
+    scene = lasting(layered("tipping"), 0.3)
+    optimum, flat = quantities(eqx.tree_at(lambda s: s.phases, scene, scene.phases[:1]), 480)
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=flat.shape) * np.maximum(np.abs(flat), 0.01)
+    slope = jax.jit(lambda fast: jax.jvp(lambda x: optimum(x, fast), (flat,), (direction,))[1])
+    if reverse:
+        slope = jax.jit(lambda fast: jax.grad(optimum)(flat, fast) @ direction)
+    value = jax.jit(optimum)
+    for fast, tolerance in ((False, 1e-5), (True, 3e-5)):
+        difference = (value(flat + 1e-5 * direction, fast) - value(flat - 1e-5 * direction, fast)) / 2e-5
+        assert float(slope(fast)) == pytest.approx(float(difference), rel=tolerance)

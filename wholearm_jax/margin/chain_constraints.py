@@ -72,14 +72,19 @@ def point_force(p: PathProgramme, b, torque) -> Float[Array, "facets points"]:
 
 def motor_torque(p: PathProgramme, b, torque) -> Float[Array, "2 points"]:
     """Torques of the motors: with what viscous friction takes."""
-    moving = b > 0
-    return torque + p.viscous * jnp.where(moving, jnp.sqrt(jnp.where(moving, b, 1.0)), 0.0)
+    return torque + p.viscous * speed(b)
 
 
 def duration(p: PathProgramme, b) -> Float[Array, ""]:
     """Time that a profile takes: `sum 2 h / (v_k + v_k+1)`, exact for a constant acceleration."""
-    v = jnp.sqrt(b)
+    v = speed(b)
     return (2 * p.width / (v[1:] + v[:-1])).sum()
+
+
+def speed(b) -> Float[Array, "..."]:
+    """Speed `sqrt(b)`, without a derivative at rest."""
+    moving = b > 0
+    return jnp.where(moving, jnp.sqrt(jnp.where(moving, b, 1.0)), 0.0)
 
 
 def inequalities(p: PathProgramme, x: ChainUnknowns) -> ChainInequalities:

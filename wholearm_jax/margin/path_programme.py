@@ -120,7 +120,7 @@ def discretise(
     departs = jnp.where((each == 0) & at_rest[0], 1.0, 0.0)
     arrives = jnp.where((each == last) & at_rest[1], -1.0, 0.0)
     joint_speed = jnp.abs(velocity[:intervals, 3:]) * speed_unit[:intervals, None]
-    cap = jnp.minimum(SPEED_CAP, ((speeds.joint / joint_speed) ** 2).min(1))
+    cap = jnp.maximum(joint_speed / speeds.joint, SPEED_CAP**-0.5).max(1) ** -2  # differentiable without limits, too
     return PathProgramme(
         width=grid.width / length,
         side_node=grid.side_node,
