@@ -289,3 +289,11 @@ def test_a_law_leaves_a_finger_that_is_away_alone(data, optimum):
     assert execution.ending is ExecutionOutcome.OK
     stands = (execution.course.time > 0.6) & (execution.course.time < 1.4)
     assert np.ptp(execution.course.z[stands, 3]) < 1e-3
+
+
+def test_a_law_does_not_press_the_object_against_a_finger_that_is_away(data):
+    """Nothing but its joint's dry friction would hold that finger."""
+    scene = wa.parse(changed(data | {"phase": data["phase"][:2]}, 0, until={"theta1": 2.25}))
+    pushes = wa.trace(scene)[1]
+    assert describe_end(scene, scene.phases[1], pushes) == "finger1:v6 is made"
+    assert wa.feedback(scene, wa.optimise(scene, knots=21).torque, friction=0.05).phases[1].press == 0.0

@@ -1,5 +1,6 @@
 """The push with which a phase ends against a new contact: enough for every object to arrive, little enough to stay."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -7,7 +8,7 @@ from jaxtyping import Float
 
 from wholearm_jax.feedback.path_table import path_terms, tabulate_path
 from wholearm_jax.margin import Statics, contact_statics
-from wholearm_jax.model import Phase, Scene
+from wholearm_jax.model import AWAY_NAMES, Phase, Scene
 from wholearm_jax.phases import TracedPhase, formation_at_end
 
 LARGEST, TRIED = 60.0, 13  # pushes that are tried [rad/s^2]
@@ -23,17 +24,19 @@ class StopStatics(NamedTuple):
 
 
 def object_at_stop(scene: Scene, phase: Phase, path: TracedPhase) -> StopStatics:
-    """Return an object at the end of its path of a phase."""
+    """Return an object at the end of its path of a phase. A finger that is away has no torque, whatever touches it."""
     closed, end = formation_at_end(scene, phase, path), np.asarray(path.end)
     terms = path_terms(path.dynamics, tabulate_path(path.dynamics))
-    return StopStatics(contact_statics(scene, closed, end), terms.acceleration[-1])
+    statics = contact_statics(scene, closed, end)
+    limit = np.where([name in phase.formation.away for name in AWAY_NAMES], 0.0, statics.torque_limit)
+    return StopStatics(replace(statics, torque_limit=limit), terms.acceleration[-1])
 
 
 def stays_at_stop(stop: StopStatics) -> bool:
     """Return whether an object that is pushed against a stop can stay there.
 
     It cannot where every torque that moves it there moves it on, as where its edge comes to lie along the one finger
-    that pushes it. Where the torque limits allow no such push it can.
+    that pushes it, or where it meets a finger that is away. Where the torque limits allow no such push it can.
     """
     margin = stop.statics.best_against(stop.acceleration[[0, 3, 4]], DECISIVE).margin
     return margin > 0 or margin == -np.inf
