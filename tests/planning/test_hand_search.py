@@ -55,6 +55,18 @@ def test_the_plan_on_the_best_hand_arrives(box, found):
     assert np.asarray(found.scene.hand.joint)[:, 0].tolist() == [found.best.joint, -found.best.joint]
 
 
+def test_the_last_hand_is_better_than_its_neighbours(box):
+    """Proportions between those of the grid, to which the best plan's certificate leads."""
+    found = wa.plan_with_hand(box, by={"x": -0.004}, **SEARCH | {"refinements": 1})
+    rounds, climbed = found.trials[:-1], found.trials[-1]
+    assert found.best == climbed
+    assert climbed.bound > max(one.bound for one in rounds if not np.isnan(one.bound)) * 1.02
+    for step in (-1e-3, 1e-3):
+        beside = {"length": (climbed.length,) * 2, "joint": (climbed.joint + step,) * 2}
+        neighbour = wa.plan_with_hand(box, by={"x": -0.004}, **SEARCH | beside)
+        assert not neighbour.trials[0].bound > climbed.bound
+
+
 def test_the_search_widens_until_some_hand_has_a_plan(box, monkeypatch):
     """Hands without a plan are searched again with more effort; those on which the part does not fit are not."""
     module, efforts = importlib.import_module("wholearm_jax.planning.hand_search"), []

@@ -1,9 +1,9 @@
 """Which hand? Proportions with which the plan to a goal has the largest certificate.
 
-Hands of a grid over finger length and joint distance are tried, then those about the best one at half the spacing. On
-each the object begins as in the scene, lying on the same edge, with the fingers closed anew. The search on each hand is
-limited by configurations, few at first and more where no hand has a plan with so few: near goals are quick, far ones
-found.
+Hands of a grid over finger length and joint distance are tried, then those about the best one at half the spacing, and
+last the proportions to which the best plan's own certificate leads, its phases held fixed. On each the object begins as
+in the scene, lying on the same edge, with the fingers closed anew. The search on each hand is limited by
+configurations, few at first and more where no hand has a plan with so few: near goals are quick, far ones found.
 """
 
 import itertools
@@ -13,13 +13,16 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
+from scipy.optimize import minimize
 
 from wholearm_jax.core import as_device_array
 from wholearm_jax.model import Hand, Scene, edge_on_palm, link_overlaps, resting_configuration
+from wholearm_jax.planning.plans import make_plan
 from wholearm_jax.planning.search import PlanningResult, plan
 
 EFFORTS = (12, 48, 192)  # configurations that the search on each hand expands, until some hand has a plan
 PROPORTION_DECIMALS = 4  # of the lengths that are tried [m]
+MAX_CLIMB = 60  # hands on which a plan's phases are traced anew, at most
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ def plan_with_hand(
         length: least and largest finger length [m].
         joint: least and largest distance of each joint from the middle [m].
         grid: number of values of each in the first round.
-        refinements: rounds about the best hand, each at half the spacing of the one before.
+        refinements: rounds about the best hand, each at half the spacing of the one before; 0: no climb, either.
         max_nodes: configurations that the search on each hand expands; unless given 12, or where no hand has a plan
             with those, 48 or at last 192.
         callback: called with the number of hands tried and the largest certificate so far.
@@ -112,6 +115,11 @@ def plan_with_hand(
         )
         attempt(lengths, joints, effort)
     best = _best(tried)
+    planning = None if best is None else tried[best][2]
+    if planning is not None and refinements:
+        better_length, better_joint = _climb(scene, edge, planning, best, ranges, spacing)
+        attempt([better_length], [better_joint], effort)
+        best = _best(tried)
     trials = tuple(trial for trial, _, _ in tried.values())
     return HandSearchResult(None, scene, None, trials) if best is None else HandSearchResult(*tried[best], trials)
 
@@ -120,6 +128,34 @@ def _best(tried: Mapping[tuple[float, float], tuple[HandTrial, Scene, Any]]) -> 
     """Return the proportions with the largest certificate, the first of equals."""
     found = [(trial.bound, key) for key, (trial, _, _) in tried.items() if trial.bound > -np.inf]
     return max(found, key=lambda row: round(row[0], 6))[1] if found else None
+
+
+def _climb(scene: Scene, edge: int, planning: PlanningResult, proportions, ranges, spacing) -> list[float]:
+    """Return the proportions with the largest certificate of a plan whose phases are held fixed.
+
+    The certificate is the least of all phases, places and contacts, with kinks just where it is largest: its slopes do
+    not lead there, so that the simplex method of Nelder and Mead (1965) is used.
+    """
+    best = planning.plans[0]
+    duration = float(best.scene.phases[0].duration)
+
+    def loss(proportions) -> float:
+        changed = _start_in(scene, edge, *map(float, proportions))
+        if changed is None:
+            return np.inf
+        moved = make_plan(changed, np.asarray(changed.start), best.steps, duration, planning.goal)
+        return np.inf if moved is None else -moved.bound
+
+    begin, steps = np.array(proportions), np.array(spacing) / 2
+    inward = np.where(begin + steps > np.array(ranges)[:, 1], -steps, steps)
+    options = {
+        "initial_simplex": begin + np.vstack([np.zeros(2), np.diag(inward)]),
+        "xatol": 10.0**-PROPORTION_DECIMALS,
+        "fatol": 1e-3 * best.bound,
+        "maxfev": MAX_CLIMB,
+    }
+    end = minimize(loss, begin, method="Nelder-Mead", bounds=ranges, options=options).x
+    return [round(float(value), PROPORTION_DECIMALS) for value in end]
 
 
 def _values(low: float, high: float, count: int) -> list[float]:
