@@ -2,17 +2,18 @@
 
     python benchmarks/planning.py [--objects 2] [--seconds 5] [--quick]
 
-Objects are boxes, triangles, L shapes and random polygons, each at rest on an edge on three coplanar hands;
-goals are slides by 20 and 40 mm, turns by 15 to 60 degrees, and both. Every goal is planned for with rolling contacts,
-without, and by a random search (a rapidly exploring random tree over the same moves, as in contact-mode-guided
-planning: X. Cheng, E. Huang, Y. Hou and M. T. Mason, 2021), each for the same time. Prints and writes the shares, the
-margins, the times of plans that were found, and paths a second.
+Objects are boxes, triangles, L shapes and random polygons, each at rest on an edge on those of three coplanar hands
+whose fingers close on it without crossing; goals are slides by 20 and 40 mm, turns by 15 to 90 degrees, and both. Every
+goal is planned for with rolling contacts, with regrasps besides, with sliding contacts alone, and by a random search (a
+rapidly exploring random tree over the same moves, as in contact-mode-guided planning: X. Cheng, E. Huang, Y. Hou and
+M. T. Mason, 2021), each for the same time. Prints and writes the shares (by goal on the best of the hands, too), the
+margins, the times of plans that were found, what stands in the way of others, and paths a second.
 """
 
 import argparse
 import statistics
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 
 import equinox as eqx
 import matplotlib.pyplot as plt
@@ -36,8 +37,14 @@ GOALS = {
     **{f"turn {a} deg": {"phi": -np.radians(a)} for a in (15, 30, 45, 60)},
     "slide 20 mm, turn 30 deg": {"x": -0.02, "phi": -np.radians(30)},
 }
+FARTHER = {f"turn {a} deg": {"phi": -np.radians(a)} for a in (75, 90)}
 FINGER = {"inertia": 2e-3, "viscous": 0.02, "dry": 0.01, "torque_limit": 1.0}
-PLANNERS = ("regrasps", "rolling", "sliding only", "random tree")
+PLANNERS = {
+    "regrasps": {"regrasp_cost": 1.0},
+    "rolling": {},
+    "sliding only": {"rolling": False},
+    "random tree": None,
+}
 GOAL_SHARE = 0.2  # of the random tree's targets that are the goal
 
 
@@ -135,23 +142,25 @@ def measure(count: int, seconds: float, seed: int) -> dict:
     warm = at_rest(drawn[0][1], *HANDS["110 mm"])
     if warm is not None:
         wa.plan(warm, by=GOALS["slide 20 mm"], max_nodes=2)  # compiles
-    for kind, shape in drawn:
+    for number, (kind, shape) in enumerate(drawn):
         for hand, (joint, length) in HANDS.items():
             scene = at_rest(shape, joint, length)
-            for goal, by in GOALS.items():
-                for planner in PLANNERS:
+            if scene is None:
+                continue
+            for goal, by in (GOALS | FARTHER).items():
+                for planner, options in PLANNERS.items():
                     begun = time.perf_counter()
-                    bound, reason = None, "cannot be laid in this hand"
-                    if scene is not None and planner == "random tree":
+                    if options is None:
                         found = random_tree(scene, by, seconds, seed)
                         bound, reason = (None, "") if found is None else (found.bound, "")
-                    elif scene is not None:
-                        result = wa.plan(scene, by=by, count=1, time_limit=seconds, rolling=planner == "rolling")
+                    else:
+                        result = wa.plan(scene, by=by, count=1, time_limit=seconds, **options)
                         bound, reason = (result.plans[0].bound if result.found else None), result.reason
                         paths += result.moves
                         spent += time.perf_counter() - begun
                     rows.append(
                         {
+                            "object": number,
                             "kind": kind,
                             "hand": hand,
                             "goal": goal,
@@ -173,6 +182,26 @@ def shares(rows: list[dict], key: str) -> dict[str, dict[str, float]]:
     return {name: {p: sum(hits) / len(hits) for p, hits in group.items()} for name, group in groups.items()}
 
 
+def obstructions(rows: list[dict]) -> Counter:
+    """Count what stops the paths that lead nearer to goals that are not reached with regrasps."""
+    kinds = {"has a margin": "negative margins", "obstacle": "obstacles", "leads nearer": "there are none"}
+    failed = [row["reason"] for row in rows if row["planner"] == "regrasps" and row["bound"] is None]
+    return Counter(
+        " and ".join(kind for phrase, kind in kinds.items() if phrase in reason) or "end too soon" for reason in failed
+    )
+
+
+def best_hands(rows: list[dict]) -> dict[str, dict[str, float]]:
+    """Share of objects for which each planner reaches a goal on at least one hand, by goal."""
+    reached: dict = defaultdict(bool)
+    for row in rows:
+        reached[row["goal"], row["planner"], row["object"]] |= row["bound"] is not None
+    groups: dict = defaultdict(lambda: defaultdict(list))
+    for (goal, planner, _), hit in reached.items():
+        groups[goal][planner].append(hit)
+    return {goal: {p: float(np.mean(hits)) for p, hits in group.items()} for goal, group in groups.items()}
+
+
 def report(found: dict) -> None:
     """Print tables of shares, margins where two planners found a plan, and times."""
     rows = found["rows"]
@@ -180,6 +209,12 @@ def report(found: dict) -> None:
         print(f"\n{key:26s}" + "".join(f"{p:>14s}" for p in PLANNERS))
         for name, group in shares(rows, key).items():
             print(f"{name:26s}" + "".join(f"{100 * group[p]:13.0f}%" for p in PLANNERS))
+    print("\non the best of an object's hands")
+    for name, group in best_hands(rows).items():
+        print(f"{name:26s}" + "".join(f"{100 * group[p]:13.0f}%" for p in PLANNERS))
+    print("\nwhere there is no plan with regrasps, the paths that lead nearer")
+    for reason, count in obstructions(rows).most_common():
+        print(f"{count:4d} {reason}")
     by_planner = {p: [row for row in rows if row["planner"] == p] for p in PLANNERS}
     pairs = [
         (a["bound"], b["bound"])
@@ -199,12 +234,12 @@ def report(found: dict) -> None:
 
 def draw(rows: list[dict]) -> plt.Figure:
     """Shares of goals reached by kind of object, hand and goal."""
-    figure, axes = plt.subplots(1, 3, figsize=(9.6, 3.4), sharey=True, layout="constrained", width_ratios=(4, 3, 7))
+    figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.4), sharey=True, layout="constrained", width_ratios=(4, 3, 9))
     for ax, key in zip(axes, ("kind", "hand", "goal"), strict=True):
         table = shares(rows, key)
         for k, planner in enumerate(PLANNERS):
-            at = np.arange(len(table)) + 0.27 * (k - 1)
-            ax.bar(at, [100 * group[planner] for group in table.values()], 0.25, color=COLOURS[k], label=planner)
+            at = np.arange(len(table)) + 0.21 * (k - 1.5)
+            ax.bar(at, [100 * group[planner] for group in table.values()], 0.2, color=COLOURS[k], label=planner)
         ax.set_xticks(range(len(table)), list(table), rotation=30, ha="right", fontsize=8)
         ax.set_title(key, fontsize=9)
         ax.spines[["top", "right"]].set_visible(False)
@@ -222,7 +257,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one hand, two goals, half a second; nothing is written")
     given = parser.parse_args()
     if given.quick:
-        for table, kept in ((HANDS, ["110 mm"]), (GOALS, ["slide 20 mm", "turn 15 deg"])):
+        for table, kept in ((HANDS, ["110 mm"]), (GOALS, ["slide 20 mm", "turn 15 deg"]), (FARTHER, [])):
             for name in {*table} - {*kept}:
                 del table[name]
     found = measure(1 if given.quick else given.objects, 0.5 if given.quick else given.seconds, given.seed)
