@@ -9,6 +9,8 @@ import pytest
 from support import layered
 
 from wholearm_jax.core.errors import SceneError
+from wholearm_jax.feedback import Controller, PhaseLaw
+from wholearm_jax.files.controller_json import write_controller
 from wholearm_jax.files.results import summary, write_summary, write_torque, write_trajectory
 from wholearm_jax.files.scene_toml import parse, to_dict
 from wholearm_jax.model.schedule import torque_schedule
@@ -94,6 +96,41 @@ def test_where_each_phase_begins_and_ends(folder):
             np.testing.assert_allclose([float(v) for v in text.split(",")], 1e3 * position[:2], atol=0.051)
         for text, angle in ((begin_angle, first[2]), (end_angle, last[2]), (turn, last[2] - first[2])):
             assert float(text) == pytest.approx(np.degrees(angle), abs=0.051)
+
+
+def law(*names):
+    """A law of phases along one straight path, the last of them pressed against a contact."""
+    common = {"contacts": ("palm:v4",), "flows": False, "margin": 0.25, "approach": 0.15}
+    path = {"s": [0.0, 0.5], "theta": [[1.0, 1.0], [1.4, 1.3]], "tangent": [[0.8, 0.6]] * 2}
+    motion = {"time": [0.0, 0.3], "s_ref": [0.0, 0.5], "v_ref": [0.0, 0.0]}
+    torques = {"torque": [[0.1, 0.2]] * 2, "gain": [[2e-3, -1e-3]] * 2}
+    tables = {name: np.array(values) for name, values in (path | motion | torques).items()}
+    phases = [
+        PhaseLaw(name=name, reach=press / 200, press=press, **common, **tables)
+        for name, press in zip(names, (0.0, 20.0), strict=True)
+    ]
+    return Controller("", tuple(phases), 60.0, 10.0, 200.0, 0.3, (0.05, 0.03), 1.0, np.ones(2))
+
+
+def test_a_law_has_a_table_of_what_it_holds_and_how_its_phases_end(copied):
+    assert 'id="law"' not in report(copied)
+    write_controller(law("near", "far"), copied / "controller.json")
+    page = report(copied)
+    rows = re.findall(r"<tr><th scope.*?</tr>", re.search(r'<table id="law">.*?</table>', page, re.DOTALL)[0])
+    cells = [re.findall(r"<t[dh][^>]*>([^<]*)</t[dh]>", row) for row in rows]
+    assert cells == [
+        ["near", "0.25", "0.3", "0.5", "by the clock, at rest"],
+        ["far", "0.25", "0.3", "0.5", "pressed against the new contact, by up to 0.04 and 0.02 N m"],
+    ]
+
+
+def test_a_law_of_another_plan_is_refused(copied):
+    write_controller(law("near", "farther"), copied / "controller.json")
+    with pytest.raises(SceneError, match=r"controller\.json: phases are not those of summary\.json"):
+        report(copied)
+    (copied / "controller.json").write_text("{}")
+    with pytest.raises(SceneError, match=r"controller\.json: version"):
+        report(copied)
 
 
 def test_a_plan_without_motion(folder):

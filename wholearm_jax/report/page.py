@@ -9,6 +9,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomli_w
 from jinja2 import Environment, PackageLoader
 
@@ -36,7 +37,8 @@ SETTING_NAMES = {
 def report(folder: str | Path) -> str:
     """Return the report of a result folder as one HTML page.
 
-    Reads `summary.json`, `trajectory.csv` and `torque.csv`. Raises `SceneError` naming the file and what is wrong.
+    Reads `summary.json`, `trajectory.csv`, `torque.csv` and, if there is one, `controller.json`. Raises `SceneError`
+    naming the file and what is wrong.
     """
     return render(load_result_folder(folder))
 
@@ -52,6 +54,8 @@ def render(result: ResultFolder) -> str:
         critical=critical_phase(summary),
         rows=[row | {"reached": _bound_fraction(row)} for row in summary["phases"]],
         poses=_poses(result),
+        law=result.controller,
+        endings=[_ending(phase) for phase in result.controller["phases"]] if result.controller else [],
         settings=_settings(summary),
         scene_toml=tomli_w.dumps(summary["scene"]),
         colours={
@@ -70,6 +74,17 @@ def _bound_fraction(row: dict[str, Any]) -> str:
     if row["status"] != Status.OK.label or not bound or margin is None:
         return DASH
     return f"{100 * margin / bound:.1f} %" if margin > 0 and bound > 0 else DASH
+
+
+def _ending(phase: dict[str, Any]) -> str:
+    """Say how a law ends a phase."""
+    if phase["flows"]:
+        return "at the path's end, in motion"
+    if phase["reach"] == 0:
+        return "by the clock, at rest"
+    pressed = phase["press"] * np.abs(phase["gain"][-1])
+    torques = " and ".join(f"{torque:.2g}" for torque in pressed)
+    return f"pressed against the new contact, by up to {torques} N m"
 
 
 def _poses(result: ResultFolder) -> list[dict[str, str]]:

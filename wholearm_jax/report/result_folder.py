@@ -12,7 +12,16 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from wholearm_jax.core import SceneError, Status
-from wholearm_jax.files import TRAJECTORY_COLUMNS, Positive, explain_validation_error, parse, read_torque
+from wholearm_jax.core.errors import BadInput
+from wholearm_jax.files import (
+    TRAJECTORY_COLUMNS,
+    Positive,
+    controller_to_dict,
+    explain_validation_error,
+    parse,
+    read_controller,
+    read_torque,
+)
 from wholearm_jax.model import Scene, TorqueSchedule
 
 
@@ -56,10 +65,11 @@ class ResultFolder(NamedTuple):
     scene: Scene
     torque: TorqueSchedule
     trajectories: dict[str, np.ndarray]  # phase name -> (samples, 1 + numbers of a row): time, then TRAJECTORY_COLUMNS'
+    controller: dict[str, Any] | None = None  # the closed-loop law as its file says it, if the folder holds one
 
 
 def load_result_folder(folder: str | Path) -> ResultFolder:
-    """Read `summary.json`, `trajectory.csv` and `torque.csv`.
+    """Read `summary.json`, `trajectory.csv`, `torque.csv` and, if there is one, `controller.json`.
 
     Raises:
         SceneError: naming the file and what is wrong with it.
@@ -73,7 +83,7 @@ def load_result_folder(folder: str | Path) -> ResultFolder:
     if names != [phase.name for phase in scene.phases]:
         raise SceneError(f"{folder / 'summary.json'}: phases are not those of its scene")
     trajectories = _read_trajectory(folder / "trajectory.csv", names)
-    return ResultFolder(summary, scene, read_torque(folder / "torque.csv"), trajectories)
+    return ResultFolder(summary, scene, read_torque(folder / "torque.csv"), trajectories, _read_law(folder, names))
 
 
 def critical_phase(summary: dict[str, Any]) -> dict[str, Any] | None:
@@ -96,6 +106,20 @@ def _read_summary(path: Path) -> dict[str, Any]:
         explanation = explain_validation_error(error)
         raise SceneError(f"{path}: {explanation}; it is not a summary that this library wrote") from None
     return summary
+
+
+def _read_law(folder: Path, names: list[str]) -> dict[str, Any] | None:
+    """Read the law of a plan's phases, if the folder holds one."""
+    path = folder / "controller.json"
+    if not path.exists():
+        return None
+    try:
+        law = controller_to_dict(read_controller(path))
+    except BadInput as error:
+        raise SceneError(str(error)) from None
+    if [phase["name"] for phase in law["phases"]] != names:
+        raise SceneError(f"{path}: phases are not those of summary.json")
+    return law
 
 
 def _read_trajectory(path: Path, names: list[str]) -> dict[str, np.ndarray]:
