@@ -151,20 +151,25 @@ def changed(*changes):
     return load_scene(layered_file("heptagon"), list(changes))
 
 
-def test_set_takes_angles(capsys):
+def test_set_takes_angles_and_lengths(capsys):
     scene = changed("start.phi=-15 deg", "1.until.phi=-20deg", "slide left.until.x=0.001", "start.theta1=1.9")
     assert scene.start[2:4].tolist() == [math.radians(-15), 1.9]
     assert float(scene.phases[1].target.until_value) == math.radians(-20)
     assert int(scene.phases[1].target.until_coordinate) == 2
     assert float(scene.phases[0].target.until_value) == 0.001
     assert capsys.readouterr().err == ""
+    scene = changed("start.x=-20 mm", "start.y=4cm", "slide left.until.x=0.1 m")
+    assert scene.start[:2].tolist() == [-0.02, 0.04]
+    assert float(scene.phases[0].target.until_value) == 0.1
     changed("start.phi=-15")
     assert 'degrees are written "-15 deg"' in capsys.readouterr().err
 
 
 BAD_CHANGES = {
     "start.phi=fast": "phi is a number of radians or a text such as '-40 deg'",
-    "start.x=3 deg": "x is a number of metres",
+    "start.x=3 deg": "x is a number of metres or a text such as '-20 mm'",
+    "start.x=mm": "x is a number of metres",
+    "start.x=inf mm": "x is a number of metres",
     "start.z=3": "write PHASE.duration=SECONDS, PHASE.until.COORDINATE=VALUE or start.COORDINATE=VALUE",
     "1.until.phi=nan": "phi is a number of radians",
     "1.until.speed=1": "write PHASE.duration=SECONDS",

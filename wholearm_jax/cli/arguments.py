@@ -18,8 +18,11 @@ ARRIVAL_FRACTION = 0.01  # of a path's length: perturbed plans cannot end where 
 TORQUE_HELP = "Torque schedule, CSV with the header t,tau1,tau2."
 SET_HELP = (
     "PHASE.duration=SECONDS, PHASE.until.COORDINATE=VALUE or start.COORDINATE=VALUE; PHASE is a name or a number from "
-    '0, an angle a number of radians or "-40 deg". May be repeated.'
+    '0, VALUE in metres, radians, "-20 mm" or "-40 deg". May be repeated.'
 )
+
+LENGTH_HINT = "a number of metres or a text such as '-20 mm'"
+METRE_PARTS = {"mm": 1000, "cm": 100, "m": 1}  # of each unit in a metre, by the units' names
 
 SceneName = Annotated[str, typer.Argument(help="A bundled scene's name, or the path of a scene file.")]
 TorqueFile = Annotated[Path, typer.Option("--torque", help=TORQUE_HELP)]
@@ -81,7 +84,7 @@ def _until_of(phase):
 
 
 def read_coordinate(source: str, coordinate: str, text: str) -> float:
-    """Read a coordinate's value: metres, radians or an angle with its unit; `source` is what an error names."""
+    """Read a coordinate's value: metres, radians, or a number with its unit; `source` is what an error names."""
     from wholearm_jax.files.angles import ANGLE_HINT, is_beyond_a_turn, read_angle
     from wholearm_jax.model import ANGLE_COORDINATES
 
@@ -92,12 +95,18 @@ def read_coordinate(source: str, coordinate: str, text: str) -> float:
             note(f'{source}: {number:g} radians are more than a whole turn; degrees are written "{number:g} deg"')
     except ValueError:
         try:
-            number = read_angle(text) if is_angle else float("nan")
+            number = read_angle(text) if is_angle else _read_length(text)
         except ValueError:
             number = float("nan")
     if not abs(number) < float("inf"):
-        raise BadInput(f"{source}: {coordinate} is {ANGLE_HINT if is_angle else 'a number of metres'}")
+        raise BadInput(f"{source}: {coordinate} is {ANGLE_HINT if is_angle else LENGTH_HINT}")
     return number
+
+
+def _read_length(text: str) -> float:
+    """Return the metres of a text such as `-20 mm`; raise `ValueError` for one that is no length."""
+    number, unit = next(((text.removesuffix(unit), unit) for unit in METRE_PARTS if text.endswith(unit)), (text, ""))
+    return float(number) / METRE_PARTS.get(unit, 1)
 
 
 def phase_number(scene, phase: str) -> int | None:

@@ -19,7 +19,7 @@ from wholearm_jax.cli.arguments import (
 from wholearm_jax.cli.progress import solver_progress
 from wholearm_jax.cli.tables import Column, print_json, print_table
 
-GOAL_HELP = 'Where the object is to be, such as "x=-0.03,phi=-40 deg" [m, rad]; instead of the scene\'s [goal].'
+GOAL_HELP = 'Where the object is to be, such as "x=-30 mm,phi=-40 deg"; instead of the scene\'s [goal].'
 HAND_HELP = (
     "Search for the hand, too: ranges of finger length and of each joint's distance from the middle [m], "
     'such as "length=0.08:0.20,joint=0.03:0.08".'
@@ -35,8 +35,8 @@ NUMBERS = ("from x, y mm", "phi deg", "to x, y mm", "phi deg", "turn deg", "boun
 def plan(
     scene: SceneName,
     goal: Annotated[str | None, typer.Option(help=GOAL_HELP)] = None,
-    by: Annotated[str | None, typer.Option(help='The same, relative to the start, such as "x=-0.03".')] = None,
-    tolerance: Annotated[str | None, typer.Option(help='Such as "x=0.001,phi=1 deg", which is the default.')] = None,
+    by: Annotated[str | None, typer.Option(help='The same, relative to the start, such as "x=-30 mm".')] = None,
+    tolerance: Annotated[str | None, typer.Option(help='Such as "x=1 mm,phi=1 deg", which is the default.')] = None,
     margin: Annotated[float, typer.Option(help="Least margin of compressive force that a plan must allow [N].")] = 0.0,
     count: Annotated[int, typer.Option(min=1, help="Number of plans at most.")] = 3,
     phases: Annotated[int, typer.Option(min=1, help="Longest plan.")] = 24,
