@@ -1,5 +1,7 @@
 """Plans from a start and a goal: traced anew, they arrive; where there is none, the reason is right."""
 
+import json
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -87,6 +89,7 @@ def test_a_finger_moves_alone_only_where_regrasps_are_allowed():
     assert not wa.plan(scene, **wanted, max_phases=2, rolling=False).found
     found = wa.plan(scene, **wanted, max_phases=2, regrasp_cost=0.5, count=1)
     assert [step.regrasp for step in found.plans[0].steps] == ["finger1:away"]
+    assert found.plans[0].scene.phases[0].name == "1: finger1:away"
     assert found.plans[0].bound > 0
     assert wa.optimise(found.plans[0].scene, knots=11).result.status is wa.Status.OK
 
@@ -214,3 +217,14 @@ def test_the_command_writes_a_scene_that_optimise_takes(wholearm, tmp_path):
     refused, _, err = wholearm("plan", path, "--by", "q=1")
     assert refused == 2
     assert "write coordinates and values" in err
+
+
+def test_the_command_says_what_a_finger_does_that_moves_alone(wholearm):
+    command = ("plan", "heptagon", "--goal", "theta1=0.9", "--regrasp-cost", "0", "--count", "1", "--phases", "1")
+    code, out, _ = wholearm(*command)
+    assert code == 0
+    assert "regrasp" in out
+    assert "finger1:away" in out
+    code, out, _ = wholearm(*command, "--json")
+    assert code == 0
+    assert [phase["regrasp"] for phase in json.loads(out)["plans"][0]["phases"]] == ["finger1:away"]

@@ -154,6 +154,7 @@ def _json_plan(one) -> dict[str, Any]:
         "phases": [
             {
                 "contacts": step.contacts,
+                "regrasp": step.regrasp,
                 "toward": step.toward,
                 "until": dict([step.until]) if step.until else None,
                 "begin": begin.tolist(),
@@ -176,7 +177,8 @@ def _rows(one) -> list[tuple[str, ...]]:
         ]
         until = one.reasons[k] if step.until is None else f"{step.until[0]} = {step.until[1]:.4g}"
         turn = f"{math.degrees(end[2] - begin[2]):.1f}"
-        rows.append((str(k + 1), " ".join(step.contacts), step.toward, until, *poses, turn, f"{bound:.3g}"))
+        contacts = [f"regrasp {step.regrasp}:", *step.contacts] if step.regrasp else step.contacts
+        rows.append((str(k + 1), " ".join(contacts), step.toward, until, *poses, turn, f"{bound:.3g}"))
     return rows
 
 

@@ -100,7 +100,7 @@ def _as_scene(scene: Scene, start: Float[np.ndarray, "5"], steps: tuple[Step, ..
     """Write steps as the phases of a scene."""
     phases = tuple(
         Phase(
-            f"{k + 1}: {step.toward}",
+            f"{k + 1}: {step.regrasp or step.toward}",
             contact_formation(step.contacts),
             path_target(step.toward, dict([step.until]) if step.until else None),
             as_device_array(duration),
