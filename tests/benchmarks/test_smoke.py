@@ -22,15 +22,22 @@ RUNS = {  # what each runs, after `import NAME as module`
     "gradients": "module.KNOTS, module.TOLERANCES = (4,), (1e-4,); run('--quick')",
     "interruption": "run('--runs', '1', '--latest', '3')",
     "optimisation": "module.random_plans = lambda *_: (); run('--quick', '--knots', '8')",
-    "planning": "module.PLANNERS = ('rolling', 'random tree'); run('--quick')",
+    "planning": "module.PLANNERS = {'rolling': {}, 'random tree': None}; run('--quick')",
     "plan_executions": "run('--quick')",
     "prediction": "module.SORTS, module.TIMESTEP = {'stopping': 1}, 4e-4; run('--quick', '--seeds', '0')",
     "random_plans": "run('--count', '1', '--phases', '1')",
+    "shortest_times": "run('--quick')",
     "skipping": "module.problems = lambda **_: PROBLEMS(referred=False)[:1]; run('--quick')",
     "work_precision": "print(module.in_turn(PROBLEMS(referred=False)[0], 'Dopri8', 1e-7, 1))",
 }
 QUICK = ("collocation", "interruption", "planning", "random_plans")
-NEEDS = {"collocation": "casadi", "optimisation": "casadi", "skipping": "numba", "work_precision": "numba"}
+NEEDS = {
+    "collocation": "casadi",
+    "optimisation": "casadi",
+    "shortest_times": "toppra",
+    "skipping": "numba",
+    "work_precision": "numba",
+}
 PRELUDE = """
 import sys, jax, wholearm_jax
 # Compiled as the tests are, whose programs are kept: benchmarks that time compiling keep none.
