@@ -86,7 +86,7 @@ def linear_rows(dynamics: PathDynamics, margin: float, segment, s) -> Float[np.n
 
 
 def reachable_sets(dynamics: PathDynamics, margin: float):
-    """Return TOPP-RA's problem, to be solved, and its grid."""
+    """Return TOPP-RA's problem, to be solved, its grid, and its unit of time [s]."""
     programme = discretise(dynamics, jnp.asarray(jnp.inf), rest_to_rest(), PROGRAMME_INTERVALS)
     nodes, segment = np.asarray(programme.node_s), np.asarray(programme.segment)[:PROGRAMME_INTERVALS]
     # In the middle of each interval, and where a segment begins and ends; the squared speed there is `x + 2 d u`.
@@ -101,14 +101,17 @@ def reachable_sets(dynamics: PathDynamics, margin: float):
     rows = np.concatenate(parts, axis=1)
     rows = rows[:, np.any(rows != 0, axis=(0, 2))]
     rows = np.concatenate([rows, np.zeros_like(rows[:1])])
+    # In units of the path's length and of the programme's time: TOPP-RA's solver takes numbers near one alone.
+    length, unit = nodes[-1] - nodes[0], float(programme.time_unit)
+    rows, nodes = rows * [length / unit**2, (length / unit) ** 2, 1.0], (nodes - nodes[0]) / length
     path = toppra.SplineInterpolator(nodes[[0, -1]], nodes[[0, -1], None])
-    return TOPPRA([Rows(rows)], path, gridpoints=nodes, solver_wrapper="seidel"), nodes
+    return TOPPRA([Rows(rows)], path, gridpoints=nodes, solver_wrapper="seidel"), nodes, unit
 
 
-def shortest(problem: TOPPRA, nodes) -> float:
-    """Solve TOPP-RA's problem and return the time [s]."""
+def shortest(problem: TOPPRA, nodes, unit: float) -> float:
+    """Solve TOPP-RA's problem and return the time [s]; NaN where its solver fails."""
     speed = problem.compute_parameterization(0.0, 0.0)[1]
-    return np.inf if speed is None else float((2 * np.diff(nodes) / (speed[1:] + speed[:-1])).sum())
+    return np.nan if speed is None else unit * float((2 * np.diff(nodes) / (speed[1:] + speed[:-1])).sum())
 
 
 def measure(name: str, shares: tuple[float, ...]) -> list[dict]:
@@ -127,9 +130,9 @@ def measure(name: str, shares: tuple[float, ...]) -> list[dict]:
             def ours(margin=margin, dynamics=dynamics, speeds=speeds, rolling=rolling):
                 return jax.block_until_ready(shortest_duration(dynamics, margin, speeds, rolling))
 
-            problem, nodes = reachable_sets(dynamics, share * top)
-            times = compare({"ours": ours, "toppra": lambda problem=problem, nodes=nodes: shortest(problem, nodes)})
-            found = {"ours": float(ours().duration), "toppra": shortest(problem, nodes)}
+            problem = reachable_sets(dynamics, share * top)
+            times = compare({"ours": ours, "toppra": lambda problem=problem: shortest(*problem)})
+            found = {"ours": float(ours().duration), "toppra": shortest(*problem)}
             rows.append({"scene": name, "phase": phase.name, "share": share, "durations": found, "seconds": times})
             ratio, speed = found["ours"] / found["toppra"], times["toppra"] / times["ours"]
             print(
