@@ -29,7 +29,7 @@ from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import moves_from
 from wholearm_jax.planning.plans import Step, make_plan
 from wholearm_jax.planning.successors import touching_contacts
-from wholearm_jax.plotting import LINK_COLOURS as COLOURS
+from wholearm_jax.plotting.palette import CONTACT_COLOURS
 
 HANDS = {"110 mm": (0.08, 0.11), "130 mm": (0.08, 0.13), "90 mm, close": (0.055, 0.09)}  # joints' x, lengths [m]
 GOALS = {
@@ -239,7 +239,9 @@ def draw(rows: list[dict]) -> plt.Figure:
         table = shares(rows, key)
         for k, planner in enumerate(PLANNERS):
             at = np.arange(len(table)) + 0.21 * (k - 1.5)
-            ax.bar(at, [100 * group[planner] for group in table.values()], 0.2, color=COLOURS[k], label=planner)
+            ax.bar(
+                at, [100 * group[planner] for group in table.values()], 0.2, color=CONTACT_COLOURS[1 + k], label=planner
+            )
         ax.set_xticks(range(len(table)), list(table), rotation=30, ha="right", fontsize=8)
         ax.set_title(key, fontsize=9)
         ax.spines[["top", "right"]].set_visible(False)
