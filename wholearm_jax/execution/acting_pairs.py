@@ -2,8 +2,9 @@
 
 Slabs and wedges are thicker than what they stand for. A fingertip touches an edge only where its finger comes from the
 edge's outer side: from the inner side the finger meets an end of the edge first, and a tip that slips past that vertex,
-a little inside it, would catch on the edge. And a dot of a finger meets that face of the other finger on whose side it
-last was beyond that finger's end, around which it may pass.
+a little inside it, would catch on the edge. A vertex touches a finger as far as its tip, where the slab goes on: its
+end would push away along the finger a vertex that is less far from the tip than it has sunk in. And a dot of a finger
+meets that face of the other finger on whose side it last was beyond that finger's end, around which it may pass.
 """
 
 # MuJoCo's names come from a compiled module, which type checkers cannot see into.
@@ -15,7 +16,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from wholearm_jax.model import EDGE, LINKS, Hand, parse_contact
+from wholearm_jax.model import EDGE, LINKS, VERTEX, Hand, parse_contact
 
 FAR_BELOW = 1e9  # how far below its margin a contact that is left out would act
 
@@ -27,6 +28,15 @@ class EdgePairs:
     row: Int[np.ndarray, "edge_pairs"]
     finger: Int[np.ndarray, "edge_pairs"]
     normal: Float[np.ndarray, "edge_pairs 2"]  # in the object's frame
+
+
+@dataclass(frozen=True)
+class VertexPairs:
+    """Pairs of a vertex and a finger: rows of MuJoCo's pairs, fingers (0 or 1), and vertices in the object's frame."""
+
+    row: Int[np.ndarray, "vertex_pairs"]
+    finger: Int[np.ndarray, "vertex_pairs"]
+    vertex: Complex[np.ndarray, "vertex_pairs"]  # as `x + iy` [m]
 
 
 @dataclass(frozen=True)
@@ -47,6 +57,7 @@ class ActingPairs:
     """What decides which pairs act; those that do begin at a `gap` [m]."""
 
     edges: EdgePairs
+    vertices: VertexPairs
     faces: FacePairs
     hand: Hand
     gap: float
@@ -54,7 +65,8 @@ class ActingPairs:
 
 def acting_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid, hand: Hand, gap: float) -> ActingPairs:
     """Return the pairs of a model, whose contacts are `names`, that act at some times only."""
-    return ActingPairs(_edge_pairs(model, names, solid), _face_pairs(model, hand), hand, gap)
+    vertices = _vertex_pairs(model, names, solid)
+    return ActingPairs(_edge_pairs(model, names, solid), vertices, _face_pairs(model, hand), hand, gap)
 
 
 def _edge_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid) -> EdgePairs:
@@ -64,6 +76,13 @@ def _edge_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid) -> EdgePai
     found = [(model.pair(name).id, link - 1, feature) for name, link, kind, feature in parsed if kind == EDGE]
     row, finger, feature = np.array(found).T
     return EdgePairs(row, finger, np.stack([along[feature, 1], -along[feature, 0]], axis=1))
+
+
+def _vertex_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid) -> VertexPairs:
+    parsed = [(name, *parse_contact(name)[:3]) for name in names]
+    found = [(model.pair(name).id, link - 1, k) for name, link, kind, k in parsed if kind == VERTEX and link > 0]
+    row, finger, feature = np.array(found).T
+    return VertexPairs(row, finger, solid.vertices[feature] @ np.array([1, 1j]))
 
 
 def _face_pairs(model: mujoco.MjModel, hand) -> FacePairs:
@@ -84,6 +103,10 @@ def choose_pairs(
     Faces are chosen anew where a dot is beyond the other finger's end, or `everywhere`.
     """
     phi, angles = qpos[2], qpos[3:]
+    hand, vertices = acting.hand, acting.vertices
+    joint, turn = (hand.joint @ np.array([1, 1j]))[vertices.finger], np.exp(1j * angles)[vertices.finger]
+    along = ((qpos[0] + 1j * qpos[1] + vertices.vertex * np.exp(1j * phi) - joint) / turn).real
+    _act(model, acting, vertices.row, along <= hand.length[vertices.finger])
     normal, toward_tip = acting.edges.normal, angles[acting.edges.finger] - phi
     from_outside = normal[:, 0] * np.cos(toward_tip) + normal[:, 1] * np.sin(toward_tip) <= 0
     _act(model, acting, acting.edges.row, from_outside)

@@ -56,7 +56,7 @@ POINT_RADIUS = 1e-5  # radius of a dot [object radii]: far above rounding, its l
 PAIR_DISTANCE = (
     1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
 )
-CORNER = 2e-3  # by how much finger and palm go on beyond the joint [object radii]
+CORNER = 2e-3  # by how much finger and palm go on beyond the joint, and the finger beyond its tip [object radii]
 LINK_GIVE = 1e-3  # how far contacts between links give way, over those with the object
 HALF_SPACE_DEPTH = 0.2  # slabs, and all shapes in depth [object radii]
 
@@ -230,7 +230,7 @@ def _add_hand(spec, hand, size, compliance):
             solref_limit=compliance["solref"],
             solimp_limit=compliance["solimp"],
         )
-        _add_slab(finger, name, -beyond[k], length, side * offset - side * dot, -side, thick)
+        _add_slab(finger, name, -beyond[k], length + CORNER * size, side * offset - side * dot, -side, thick)
         _add_geom(finger, f"{name}_tip", "SPHERE", [dot, 0, 0], [length, side * offset, 0])
         back = float(hand.back[k])
         _add_slab(finger, f"{name}_back", 0.0, length, -side * (back - dot), side, thick)

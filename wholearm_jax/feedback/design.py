@@ -172,25 +172,26 @@ def _with_either_formation(
 ) -> list[list[PathTerms]]:
     """Add, next to each hand-over, the objects as the other formation holds them.
 
-    Measured angles do not tell there which of the two holds the object: the law has to move it under both.
+    Measured angles do not tell there which of the two holds the object: the law has to move it under both, and the
+    torques that move it under the one must not lose it under the other, which takes over at once.
     """
     found = [[*each] for each in terms]
     for k in np.flatnonzero(hand_overs):
         near_end = tables[k].s > tables[k].s[-1] - UNSURE
         near_start = tables[k + 1].s < UNSURE
-        found[k] += [_replaced(own, near_end, other, 0) for own, other in zip(*terms[k : k + 2], strict=True)]
-        found[k + 1] += [_replaced(own, near_start, other, -1) for other, own in zip(*terms[k : k + 2], strict=True)]
+        for before, after in zip(*terms[k : k + 2], strict=True):
+            found[k] += _either(before, near_end, after, 0)
+            found[k + 1] += _either(after, near_start, before, -1)
     return found
 
 
-def _replaced(own: PathTerms, rows, other: PathTerms, at: int) -> PathTerms:
-    """Replace some rows of a path's terms by those at one place of another path."""
+def _either(own: PathTerms, rows, other: PathTerms, at: int) -> list[PathTerms]:
+    """Put one place of another path in some rows of a path's terms: all of it, how it moves, and what it must keep."""
     facets = max(own.slack.shape[1], other.slack.shape[1])
     slack, there = (_with_facets(each.slack, facets) for each in (own, other))
-    return PathTerms(
-        np.where(rows[:, None], other.acceleration[at], own.acceleration),
-        np.where(rows[:, None, None], there[at], slack),
-    )
+    moves = np.where(rows[:, None], other.acceleration[at], own.acceleration)
+    keeps = np.where(rows[:, None, None], there[at], slack)
+    return [PathTerms(moves, keeps), PathTerms(moves, slack), PathTerms(own.acceleration, keeps)]
 
 
 def _with_facets(slack: Float[np.ndarray, "nodes facets 5"], count: int) -> Float[np.ndarray, "nodes count 5"]:
