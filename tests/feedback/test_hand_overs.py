@@ -11,6 +11,7 @@ from wholearm_jax.execution.executions import execute
 from wholearm_jax.execution.mujoco_model import build_mujoco_model
 from wholearm_jax.feedback import feedback
 from wholearm_jax.feedback.path_table import path_terms, tabulate_path
+from wholearm_jax.model import rigid_body
 from wholearm_jax.phases import ends_at_stop
 
 
@@ -75,3 +76,26 @@ def test_a_fingertip_meets_an_edge_from_its_outer_side_alone(box):
     assert {"finger2:e0", "finger2:e3"} <= touching(deeper, filtered=False)
     assert "finger2:e0" in touching(deeper, filtered=True)
     assert "finger2:e3" not in touching(deeper, filtered=True)
+
+
+@pytest.mark.parametrize(("beyond", "touches"), [(-1e-6, True), (1e-6, False)])
+def test_a_vertex_meets_a_fingers_face_as_far_as_its_tip(box, beyond, touches):
+    """Sunk in by more than its distance from the tip, where the end of a slab would push it away along the finger."""
+    bodies = build_mujoco_model(box.scene, 2e-4)
+    data = mujoco.MjData(bodies.model)
+    begin = np.array(box.phases[2].traced.begin)  # vertex 1 at the tip of finger 2
+    along = np.array([np.cos(begin[4]), np.sin(begin[4])])
+    normal = np.array([along[1], -along[0]])  # into the object
+    c, s = np.cos(begin[2]), np.sin(begin[2])
+    vertex = np.array([[c, -s], [s, c]]) @ rigid_body(box.scene.object).vertices[1] + begin[:2]
+    reached = (vertex - box.scene.hand.joint[1]) @ along - box.scene.hand.length[1]
+    data.qpos[:] = begin
+    data.qpos[:2] += (beyond - reached) * along - 5e-6 * normal
+    choose_pairs(bodies.model, bodies.acting, data.qpos)
+    mujoco.mj_step1(bodies.model, data)
+    row = bodies.names.index("finger2:v1")
+    found = [c for c in data.contact if bodies.pair[c.geom[0], c.geom[1]] == row and c.efc_address >= 0]
+    assert len(found) == touches
+    for contact in found:
+        np.testing.assert_allclose(bodies.toward[row] * contact.frame[:2], normal, atol=1e-6)
+        assert contact.dist == pytest.approx(-5e-6, rel=1e-2)

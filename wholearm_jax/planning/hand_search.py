@@ -22,7 +22,7 @@ from wholearm_jax.planning.search import PlanningResult, plan
 
 EFFORTS = (12, 48, 192)  # configurations that the search on each hand expands, until some hand has a plan
 PROPORTION_DECIMALS = 4  # of the lengths that are tried [m]
-MAX_CLIMB = 60  # hands on which a plan's phases are traced anew, at most
+MAX_VARIATIONS = 60  # hands on which a plan's phases are traced anew, at most
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def plan_with_hand(
         length: least and largest finger length [m].
         joint: least and largest distance of each joint from the middle [m].
         grid: number of values of each in the first round.
-        refinements: rounds about the best hand, each at half the spacing of the one before; 0: no climb, either.
+        refinements: rounds about the best hand, each at half the spacing of the one before; 0: no last step, either.
         max_nodes: configurations that the search on each hand expands; unless given 12, or where no hand has a plan
             with those, 48 or at last 192.
         callback: called with the number of hands tried and the largest certificate so far.
@@ -117,7 +117,7 @@ def plan_with_hand(
     best = _best(tried)
     planning = None if best is None else tried[best][2]
     if planning is not None and refinements:
-        better_length, better_joint = _climb(scene, edge, planning, best, ranges, spacing)
+        better_length, better_joint = _improve_hand(scene, edge, planning, best, ranges, spacing)
         attempt([better_length], [better_joint], effort)
         best = _best(tried)
     trials = tuple(trial for trial, _, _ in tried.values())
@@ -130,7 +130,7 @@ def _best(tried: Mapping[tuple[float, float], tuple[HandTrial, Scene, Any]]) -> 
     return max(found, key=lambda row: round(row[0], 6))[1] if found else None
 
 
-def _climb(scene: Scene, edge: int, planning: PlanningResult, proportions, ranges, spacing) -> list[float]:
+def _improve_hand(scene: Scene, edge: int, planning: PlanningResult, proportions, ranges, spacing) -> list[float]:
     """Return the proportions with the largest certificate of a plan whose phases are held fixed.
 
     The certificate is the least of all phases, places and contacts, with kinks just where it is largest: its slopes do
@@ -152,7 +152,7 @@ def _climb(scene: Scene, edge: int, planning: PlanningResult, proportions, range
         "initial_simplex": begin + np.vstack([np.zeros(2), np.diag(inward)]),
         "xatol": 10.0**-PROPORTION_DECIMALS,
         "fatol": 1e-3 * best.bound,
-        "maxfev": MAX_CLIMB,
+        "maxfev": MAX_VARIATIONS,
     }
     end = minimize(loss, begin, method="Nelder-Mead", bounds=ranges, options=options).x
     return [round(float(value), PROPORTION_DECIMALS) for value in end]
