@@ -6,7 +6,7 @@ Two sets: friction of each link within 20 %, and that together with mass within 
 start within 1 mm. Both loops see the same objects; success is within 0.5 mm and 0.01 rad of each object's own path
 end, the last contacts closed. The closed loop samples at 1 kHz, 1 ms late, with encoders of 4096
 counts and 1 % of torque noise. The hexagon's flip begins at a limit of its motors, with which no law holds either set
-(it is executed all the same), so that it is here with stronger ones, too.
+(it is executed all the same), so that it is here with stronger ones, too. Results of scenes that are not run stay.
 """
 
 import argparse
@@ -16,7 +16,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from measure import RESULTS, save
+from measure import RESULTS, kept, save
 
 import wholearm_jax as wa
 from wholearm_jax.ensembles import wilson_interval
@@ -93,6 +93,8 @@ def main() -> None:
     count = 1 if options.quick else options.count
     found = {name: measure_one(name, count, options.workers) for name in options.scenes}
     if not options.quick:
+        found = kept("feedback") | found
+        found = {name: found[name] for name in SCENES if name in found}
         save("feedback", found)
         draw(found).savefig(RESULTS / "feedback.svg", bbox_inches="tight")
 
