@@ -191,15 +191,20 @@ def obstructions(rows: list[dict]) -> Counter:
     )
 
 
-def best_hands(rows: list[dict]) -> dict[str, dict[str, float]]:
-    """Share of objects for which each planner reaches a goal on at least one hand, by goal."""
-    reached: dict = defaultdict(bool)
+def best_hands(rows: list[dict]) -> list[dict]:
+    """Keep one row for each object, goal and planner: of a hand on which the goal is reached, if there is one."""
+    best: dict = {}
     for row in rows:
-        reached[row["goal"], row["planner"], row["object"]] |= row["bound"] is not None
-    groups: dict = defaultdict(lambda: defaultdict(list))
-    for (goal, planner, _), hit in reached.items():
-        groups[goal][planner].append(hit)
-    return {goal: {p: float(np.mean(hits)) for p, hits in group.items()} for goal, group in groups.items()}
+        key = row["object"], row["goal"], row["planner"]
+        if key not in best or best[key]["bound"] is None:
+            best[key] = row
+    return [*best.values()]
+
+
+def print_shares(rows: list[dict], key: str) -> None:
+    """Print a line for each value of `key`."""
+    for name, group in shares(rows, key).items():
+        print(f"{name:26s}" + "".join(f"{100 * group[p]:13.0f}%" for p in PLANNERS))
 
 
 def report(found: dict) -> None:
@@ -207,11 +212,9 @@ def report(found: dict) -> None:
     rows = found["rows"]
     for key in ("kind", "hand", "goal"):
         print(f"\n{key:26s}" + "".join(f"{p:>14s}" for p in PLANNERS))
-        for name, group in shares(rows, key).items():
-            print(f"{name:26s}" + "".join(f"{100 * group[p]:13.0f}%" for p in PLANNERS))
+        print_shares(rows, key)
     print("\non the best of an object's hands")
-    for name, group in best_hands(rows).items():
-        print(f"{name:26s}" + "".join(f"{100 * group[p]:13.0f}%" for p in PLANNERS))
+    print_shares(best_hands(rows), "goal")
     print("\nwhere there is no plan with regrasps, the paths that lead nearer")
     for reason, count in obstructions(rows).most_common():
         print(f"{count:4d} {reason}")

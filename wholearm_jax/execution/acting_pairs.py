@@ -18,6 +18,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from wholearm_jax.model import EDGE, LINKS, VERTEX, Hand, parse_contact
 
+AS_COMPLEX = np.array([1, 1j])  # `(x, y) @ AS_COMPLEX = x + iy`
 FAR_BELOW = 1e9  # how far below its margin a contact that is left out would act
 
 
@@ -32,11 +33,13 @@ class EdgePairs:
 
 @dataclass(frozen=True)
 class VertexPairs:
-    """Pairs of a vertex and a finger: rows of MuJoCo's pairs, fingers (0 or 1), and vertices in the object's frame."""
+    """Pairs of a vertex and a finger: rows of MuJoCo's pairs, fingers (0 or 1), and places as `x + iy` [m]."""
 
     row: Int[np.ndarray, "vertex_pairs"]
     finger: Int[np.ndarray, "vertex_pairs"]
-    vertex: Complex[np.ndarray, "vertex_pairs"]  # as `x + iy` [m]
+    vertex: Complex[np.ndarray, "vertex_pairs"]  # in the object's frame
+    joint: Complex[np.ndarray, "vertex_pairs"]  # the finger's, and
+    length: Float[np.ndarray, "vertex_pairs"]  # how far it goes
 
 
 @dataclass(frozen=True)
@@ -65,24 +68,27 @@ class ActingPairs:
 
 def acting_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid, hand: Hand, gap: float) -> ActingPairs:
     """Return the pairs of a model, whose contacts are `names`, that act at some times only."""
-    vertices = _vertex_pairs(model, names, solid)
-    return ActingPairs(_edge_pairs(model, names, solid), vertices, _face_pairs(model, hand), hand, gap)
+    edges, vertices = _edge_pairs(model, names, solid), _vertex_pairs(model, names, solid, hand)
+    return ActingPairs(edges, vertices, _face_pairs(model, hand), hand, gap)
 
 
 def _edge_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid) -> EdgePairs:
     corners = solid.vertices[: solid.count]
     along = np.roll(corners, -1, 0) - corners
-    parsed = [(name, *parse_contact(name)[:3]) for name in names]
-    found = [(model.pair(name).id, link - 1, feature) for name, link, kind, feature in parsed if kind == EDGE]
-    row, finger, feature = np.array(found).T
+    row, finger, feature = _finger_pairs(model, names, EDGE)
     return EdgePairs(row, finger, np.stack([along[feature, 1], -along[feature, 0]], axis=1))
 
 
-def _vertex_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid) -> VertexPairs:
+def _vertex_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid, hand) -> VertexPairs:
+    row, finger, feature = _finger_pairs(model, names, VERTEX)
+    vertex, joint = solid.vertices[feature] @ AS_COMPLEX, np.asarray(hand.joint)[finger] @ AS_COMPLEX
+    return VertexPairs(row, finger, vertex, joint, np.asarray(hand.length)[finger])
+
+
+def _finger_pairs(model: mujoco.MjModel, names: tuple[str, ...], kind: int) -> Int[np.ndarray, "3 pairs"]:
+    """Return the rows of MuJoCo's pairs of the fingers with one kind of feature, fingers (0 or 1), and features."""
     parsed = [(name, *parse_contact(name)[:3]) for name in names]
-    found = [(model.pair(name).id, link - 1, k) for name, link, kind, k in parsed if kind == VERTEX and link > 0]
-    row, finger, feature = np.array(found).T
-    return VertexPairs(row, finger, solid.vertices[feature] @ np.array([1, 1j]))
+    return np.array([(model.pair(name).id, link - 1, k) for name, link, own, k in parsed if own == kind and link > 0]).T
 
 
 def _face_pairs(model: mujoco.MjModel, hand) -> FacePairs:
@@ -103,10 +109,10 @@ def choose_pairs(
     Faces are chosen anew where a dot is beyond the other finger's end, or `everywhere`.
     """
     phi, angles = qpos[2], qpos[3:]
-    hand, vertices = acting.hand, acting.vertices
-    joint, turn = (hand.joint @ np.array([1, 1j]))[vertices.finger], np.exp(1j * angles)[vertices.finger]
-    along = ((qpos[0] + 1j * qpos[1] + vertices.vertex * np.exp(1j * phi) - joint) / turn).real
-    _act(model, acting, vertices.row, along <= hand.length[vertices.finger])
+    vertices = acting.vertices
+    corner = qpos[0] + 1j * qpos[1] + vertices.vertex * np.exp(1j * phi)
+    along = ((corner - vertices.joint) * np.exp(-1j * angles)[vertices.finger]).real
+    _act(model, acting, vertices.row, along <= vertices.length)
     normal, toward_tip = acting.edges.normal, angles[acting.edges.finger] - phi
     from_outside = normal[:, 0] * np.cos(toward_tip) + normal[:, 1] * np.sin(toward_tip) <= 0
     _act(model, acting, acting.edges.row, from_outside)
@@ -118,7 +124,7 @@ def _choose_faces(model: mujoco.MjModel, acting: ActingPairs, angles: Float[np.n
     """Let dots that are beyond the other finger's end, or all, meet that of its faces on whose side they are."""
     hand, faces = acting.hand, acting.faces
     other, finger = 1 - faces.finger, faces.finger
-    turn, joint = np.exp(1j * angles), hand.joint @ np.array([1, 1j])
+    turn, joint = np.exp(1j * angles), hand.joint @ AS_COMPLEX
     dot = (joint[other] + faces.dot * turn[other] - joint[finger]) / turn[finger]  # in the frame of the faces
     height = np.array([1.0, -1.0])[finger] * dot.imag  # toward the object
     beyond = everywhere | (dot.real > hand.length[finger])

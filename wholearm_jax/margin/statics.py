@@ -78,20 +78,18 @@ class Statics:
 
     def best(self, departure: RestAccelerations | None = None) -> StaticMargin:
         """Compute the largest margin of all torques within limits, or with a `departure` of those that move nothing."""
-        limits = np.column_stack([-self.torque_limit, self.torque_limit])
-        return self._best(limits, NO_ROWS if departure is None else departure.rest_rows())
+        return self._best(self._torque_range, NO_ROWS if departure is None else departure.rest_rows())
 
     def best_against(self, acceleration, least: float) -> StaticMargin:
         """Compute the largest margin of all torques within limits that give `acceleration @ (1, torque) >= least`.
 
         It is minus infinity where no torque does.
         """
-        limits = np.column_stack([-self.torque_limit, self.torque_limit])
-        return self._best(limits, np.array([[least, 0.0, 0.0]]) - acceleration)
+        return self._best(self._torque_range, np.array([[least, 0.0, 0.0]]) - acceleration)
 
     def most_central_torque(self, departure: RestAccelerations) -> StaticMargin:
         """Compute a torque with `MARGIN_TIE` of the largest margin, farthest from those that move the object."""
-        limits, rest_rows = np.column_stack([-self.torque_limit, self.torque_limit]), departure.rest_rows()
+        limits, rest_rows = self._torque_range, departure.rest_rows()
         top = self._best(limits, rest_rows)
         if not top.margin > 0:
             return top
@@ -105,6 +103,11 @@ class Statics:
         limits = np.column_stack([ends.min(0), ends.max(0)])
         last = self._maximise(limits, (0.0, 1.0), path=ends)
         return 0.0 if last is None else float(last.values["m"][0])
+
+    @property
+    def _torque_range(self) -> Float[np.ndarray, "2 2"]:
+        """The least and the largest torque of each joint [N m]."""
+        return np.column_stack([-self.torque_limit, self.torque_limit])
 
     def _best(self, limits, rest_rows=NO_ROWS) -> StaticMargin:
         """Maximise the margin; where no forces are possible, minus the least adhesion."""
