@@ -104,18 +104,16 @@ def carry_out(scene: wa.Scene) -> dict:
     }
 
 
-def measure(planned: Iterable[tuple[dict, wa.Scene | None]]) -> list[dict]:
-    """Carry out plans."""
-    rows = []
+def measure(planned: Iterable[tuple[dict, wa.Scene | None]]) -> Iterator[dict]:
+    """Carry out plans, one after the other."""
     for about, scene in planned:
-        rows.append(about if scene is None else about | carry_out(scene))
-        row = rows[-1]
+        row = about if scene is None else about | carry_out(scene)
         print(
             f"{row['kind']}, {row['hand']}, {row['goal']}: open loop {row.get('open_loop', 'none')};"
             f" {row.get('execution', row['message'])}",
             flush=True,
         )
-    return rows
+        yield row
 
 
 def report(label: str, rows: list[dict]) -> None:
@@ -147,17 +145,20 @@ def main() -> None:
     if given.quick:
         counts = {"without regrasps": (1, False)}
     seconds = 0.5 if given.quick else given.seconds
-    found = {
-        label: measure(itertools.islice(plans(seconds, given.seed, with_regrasps), count))
+    planned: dict[str, Iterable] = {
+        label: itertools.islice(plans(seconds, given.seed, with_regrasps), count)
         for label, (count, with_regrasps) in counts.items()
         if count
     }
     if given.tumbling:
-        found["tumbling"] = measure(tumbles(SECONDS_TO_TUMBLE))
-    for label, rows in found.items():
+        planned["tumbling"] = tumbles(SECONDS_TO_TUMBLE)
+    for label, each in planned.items():
+        rows: list[dict] = []
+        for row in measure(each):
+            rows.append(row)
+            if not given.quick:  # as they come, for a run of hours may be cut short
+                save("plan_executions", kept("plan_executions") | {label: rows})
         report(label, rows)
-    if not given.quick:
-        save("plan_executions", kept("plan_executions") | found)
 
 
 if __name__ == "__main__":
