@@ -1,15 +1,20 @@
-"""Open loop beside closed loop: how many executions of perturbed objects succeed, on the bundled plans.
+"""Does a law hold? Perturbed objects, executed open loop and in closed loop, and what the model says of them.
 
     python benchmarks/feedback.py [--count 20] [--scenes heptagon hexagon] [--quick]
 
 Two sets: friction of each link within 20 %, and that together with mass within 10 %, vertices within 0.5 mm and the
-start within 1 mm. Both loops see the same objects; success is within 0.5 mm and 0.01 rad of each object's own path
-end, the last contacts closed. The closed loop samples at 1 kHz, 1 ms late, with encoders of 4096
+start within 1 mm; for each a law is designed. Both loops see the same objects; success is within 0.5 mm and 0.01 rad of
+each object's own path end, the last contacts closed. The closed loop samples at 1 kHz, 1 ms late, with encoders of 4096
 counts and 1 % of torque noise. The hexagon's flip begins at a limit of its motors, with which no law holds either set
-(it is executed all the same), so that it is here with stronger ones, too. Results of scenes that are not run stay.
+(it is executed all the same), so that it is here with stronger ones, too.
+
+Beside each execution stands what `check` predicts of that object: whether it arrives with every contact kept, and the
+least force. Each law's certificate, the margin that it is designed with, stands beside the least margin of objects that
+are drawn from its set, those at the corners of friction and mass among them. Results of scenes that are not run stay.
 """
 
 import argparse
+import itertools
 import time
 
 import equinox as eqx
@@ -19,8 +24,9 @@ import numpy as np
 from measure import RESULTS, kept, save
 
 import wholearm_jax as wa
-from wholearm_jax.ensembles import wilson_interval
-from wholearm_jax.execution import Amounts, Hardware, run_trials
+from wholearm_jax.core import Status
+from wholearm_jax.ensembles import make_ensemble, wilson_interval
+from wholearm_jax.execution import Amounts, ExecutionOutcome, Hardware, TrialsResult, run_trials
 from wholearm_jax.plotting import LINK_COLOURS as COLOURS
 
 SCENES = ("heptagon", "hexagon", "hexagon, 2 N m", "tipping", "box", "flight", "passage")
@@ -28,7 +34,7 @@ SETS = {
     "friction": Amounts(friction=0.2),
     "friction, mass, vertices, start": Amounts(friction=0.2, mass=0.1, geometry=5e-4, start=1e-3),
 }
-MASS = 0.1  # half width of the mass that laws are designed for
+DRAWN = 48  # objects of each law's set, beside the corners
 
 
 def load(name: str) -> wa.Scene:
@@ -41,26 +47,62 @@ def load(name: str) -> wa.Scene:
 
 
 def measure_one(name: str, count: int, workers: int | None) -> dict:
-    """Both loops on one plan."""
+    """Both sets and both loops on one plan."""
     scene = load(name)
     optimum = wa.optimise(scene)
-    begun = time.perf_counter()
-    controller = wa.feedback(scene, optimum.torque, mass=MASS)
-    found = {"design_seconds": time.perf_counter() - begun, "margins": [phase.margin for phase in controller.phases]}
+    forces = np.concatenate([course.cn.ravel() for course in wa.trajectory(optimum.result)])
+    found = {"mean_force": float(np.mean(forces[forces > 0]))}
     for label, amounts in SETS.items():
-        found[label] = {}
-        for loop, more in (("open", {}), ("closed", {"controller": controller, "hardware": Hardware()})):
-            trials = run_trials(optimum.result, count, amounts, workers=workers, **more)
-            found[label][loop] = {
-                "executions": count,
-                "successes": trials.own_successes,
-                "nominal_successes": trials.successes,
-                "interval_95": list(wilson_interval(trials.own_successes, count)),
-                "median_position_error": float(np.nanmedian([run.own_position_error for run in trials.runs])),
-                "endings": [run.own_ending.value for run in trials.runs],
-            }
-            print(f"{name}, {label}, {loop} loop: {trials.message}", flush=True)
+        begun = time.perf_counter()
+        controller = wa.feedback(
+            scene, optimum.torque, friction=amounts.friction, mass=amounts.mass, shape=amounts.geometry or None
+        )
+        row = {"design_seconds": time.perf_counter() - begun, "margins": [law.margin for law in controller.phases]}
+        for loop, law in (("open", None), ("closed", controller)):
+            trials = run_trials(optimum.result, count, amounts, workers=workers, controller=law, hardware=Hardware())
+            row[loop] = summary(trials, predicted([run.scene for run in trials.runs], optimum.torque, law))
+            print(f"{name}, {label}, {loop} loop: {trials.message}; {row[loop]['agree']} as predicted", flush=True)
+        row["sampled_margin"] = sampled_margin(scene, controller, amounts)
+        found[label] = row
     return found
+
+
+def predicted(scenes: list[wa.Scene], torque: wa.TorqueSchedule, law: wa.Controller | None):
+    """What the model says of objects: status and margin of each, under the law or else open loop."""
+    return wa.check(scenes, torque) if law is None else wa.check(scenes, controller=law)
+
+
+def summary(trials: TrialsResult, model) -> dict:
+    """What became of executions, beside the model's prediction."""
+    count, runs = len(trials.runs), trials.runs
+    holds = [run.own_ending is ExecutionOutcome.OK and run.least_force > 0 for run in runs]
+    foreseen = np.asarray(model.status) == Status.OK
+    return {
+        "executions": count,
+        "successes": trials.own_successes,
+        "nominal_successes": trials.successes,
+        "interval_95": list(wilson_interval(trials.own_successes, count)),
+        "median_position_error": float(np.nanmedian([run.own_position_error for run in runs])),
+        "endings": [run.own_ending.value for run in runs],
+        "least_forces": [run.least_force if np.isfinite(run.least_force) else None for run in runs],
+        "predicted": [Status(int(status)).name.lower() for status in model.status],
+        "predicted_margins": [float(margin) if np.isfinite(margin) else None for margin in model.margin],
+        "agree": int(np.sum(np.array(holds) == foreseen)),
+    }
+
+
+def sampled_margin(scene: wa.Scene, controller: wa.Controller, amounts: Amounts) -> float:
+    """Return the least margin under a law of objects from its set: drawn ones, and those at the corners."""
+    spreads = {"friction": f"{100 * amounts.friction!r}%", "mass": f"{100 * amounts.mass!r}%"}
+    spreads |= {"vertices": amounts.geometry} if amounts.geometry else {}
+    ensemble = make_ensemble(scene, {name: each for name, each in spreads.items() if each != "0.0%"}, seed=1)
+    scenes = [ensemble.draw(k) for k in range(DRAWN)]
+    for signs in itertools.product((-1, 1), repeat=4):
+        slip = scene.object.friction * (1 + amounts.friction * np.array(signs[:3]))
+        mass = scene.object.mass * (1 + amounts.mass * signs[3])
+        scenes.append(eqx.tree_at(lambda s: (s.object.friction, s.object.mass), scene, (slip, mass)))
+    margins = np.asarray(wa.check(scenes, controller=controller).margin)
+    return float(np.nanmin(margins))
 
 
 def draw(found: dict) -> plt.Figure:
@@ -92,6 +134,7 @@ def main() -> None:
     options = parser.parse_args()
     count = 1 if options.quick else options.count
     found = {name: measure_one(name, count, options.workers) for name in options.scenes}
+    print({n: {s: (min(r[s]["margins"]), r[s]["sampled_margin"]) for s in SETS} for n, r in found.items()})
     if not options.quick:
         found = kept("feedback") | found
         found = {name: found[name] for name in SCENES if name in found}

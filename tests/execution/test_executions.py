@@ -32,7 +32,7 @@ from wholearm_jax.execution.executions import (
     target_of,
 )
 from wholearm_jax.execution.mujoco_model import CONVEX, ContactCompliance, _wedges, build_mujoco_model
-from wholearm_jax.execution.trials import Amounts, _draw_scenes, _summary, lay_in_hand, run_trials, start_near
+from wholearm_jax.execution.trials import Amounts, Reached, _draw_scenes, _summary, lay_in_hand, run_trials, start_near
 from wholearm_jax.files.execution_results import _perturbed_row, write_execution
 from wholearm_jax.model.kinematics import contact_kinematics, contact_set, normal_jacobian
 from wholearm_jax.model.mechanics import scaled_mechanics
@@ -306,7 +306,7 @@ def test_a_copy_without_friction_can_be_told():
     """Of a coefficient of 0 any share is 0."""
     scene = eqx.tree_at(lambda s: s.object.friction, layered("heptagon"), jnp.array([0.0, 0.1, 0.2]))
     (changed,) = _draw_scenes(scene, Amounts(friction=0.1), 0, 1)
-    told = _summary(scene, changed, (np.zeros(5), None), (np.zeros(5), 0.0, {}), Tolerance())
+    told = _summary(scene, changed, (np.zeros(5), None), Reached(np.zeros(5), 0.0, {}, 0.0), Tolerance())
     assert told.friction[0] == 1.0
     np.testing.assert_allclose(told.friction[1:], np.asarray(changed.object.friction[1:]) / [0.1, 0.2])
     json.dumps(_perturbed_row(told), allow_nan=False)
@@ -335,7 +335,7 @@ def test_a_plan_that_begins_with_a_rolling_contact_can_be_perturbed():
     assert all(np.isfinite(run.end).all() for run in many.runs)
     assert many.successes == 4
     assert many.own_successes == 4
-    assert many.message.endswith("at the ends of their own paths: 4")
+    assert many.message.endswith("at the ends of their own paths: 4; all contacts kept on the way: 4")
     assert all(0 < np.abs(run.own_target - target_of(prediction))[:2].max() < 1e-3 for run in many.runs)
 
 
@@ -348,7 +348,8 @@ def test_a_perturbed_object_is_judged_by_its_own_end(predictions):
     np.testing.assert_allclose(own.target, end, atol=1e-9)
     near, far = Tolerance(1e-6, 1e-6), np.abs(own.target - target_of(prediction))[:2].max()
     assert far > 1e-5
-    run = _summary(prediction.scene, scene, (target_of(prediction), own.target), (own.target, 0.0, {}), near)
+    reached = Reached(own.target, 0.0, {}, 1.0)
+    run = _summary(prediction.scene, scene, (target_of(prediction), own.target), reached, near)
     assert (run.ending is ExecutionOutcome.OK, run.own_ending is ExecutionOutcome.OK) == (False, True)
 
 

@@ -89,6 +89,17 @@ def test_without_a_shape_the_reference_stops_at_the_end(heptagon):
         feedback(heptagon.scene, heptagon.torque, shape=0.02)
 
 
+def test_the_margin_covers_parts_of_other_shape(heptagon):
+    """Parts that the design has not drawn keep what it says, to 3 %."""
+    scene, torque = heptagon.scene, heptagon.torque
+    law = feedback(scene, torque, friction=0.2, shape=SHAPE)
+    parts = draw_shapes(corner_scenes(scene, 0.2, 0.0), SHAPE, seed=1)
+    checked = wa.check(parts, controller=law)
+    assert (np.asarray(checked.status) == 0).all()
+    assert law.margin == pytest.approx(float(checked.margin.min()), rel=0.03)
+    assert law.margin < 0.95 * feedback(scene, torque, friction=0.2).margin
+
+
 def test_parts_of_other_shape_arrive_at_their_own_stops(heptagon):
     law = feedback(heptagon.scene, heptagon.torque, friction=0.2, mass=0.1, shape=SHAPE)
     amounts = Amounts(friction=0.2, mass=0.1, geometry=SHAPE, start=1e-3)

@@ -3,7 +3,7 @@
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -111,8 +111,8 @@ def _design(optimum, uncertain: dict[str, float], as_json: bool):
     """
     from wholearm_jax.feedback import feedback, held_set
 
-    friction, mass = (uncertain.get(name, 0.0) for name in ("friction", "mass"))
-    objects = {"friction": friction, "mass": mass, "shape": uncertain.get("vertices")}
+    objects: dict[str, Any] = {name: uncertain.get(name, 0.0) for name in ("friction", "mass")}
+    objects["shape"] = uncertain.get("vertices")
     controller = feedback(optimum.scene, optimum.torque, **objects)
     for phase in controller.phases if not as_json else ():
         print(f"{phase.name}: closed loop, least force {phase.margin:.4g} N over all objects of the set")
@@ -121,16 +121,19 @@ def _design(optimum, uncertain: dict[str, float], as_json: bool):
         return controller
     note(
         f"no controller.json: in '{weakest.name}' a contact of some object of the set would open, least force "
-        f"{weakest.margin:.3g} N; {_what_holds(held_set(optimum.scene, optimum.torque, **objects), friction, mass)}"
+        f"{weakest.margin:.3g} N; {_what_holds(held_set(optimum.scene, optimum.torque, **objects), uncertain)}"
     )
     return None
 
 
-def _what_holds(held, friction: float, mass: float) -> str:
+def _what_holds(held, uncertain: dict[str, float]) -> str:
     """Say for which smaller set, and with which motors, there is a law."""
-    given = {"friction": held.share * friction, "mass": held.share * mass}
-    smaller = " ".join(f"--robust {name}={100 * width:.3g}%" for name, width in given.items() if width > 0)
-    said = f"a law holds {smaller}" if smaller else "no law holds a quarter of its friction and mass either"
+    widths = {name: held.share * width for name, width in uncertain.items() if held.share * width > 0}
+    smaller = " ".join(
+        f"--robust {name}={width:.3g}" if name == "vertices" else f"--robust {name}={100 * width:.3g}%"
+        for name, width in widths.items()
+    )
+    said = f"a law holds {smaller}" if smaller else "no law holds a quarter of its ranges either"
     if held.motors is None:
         return said
     return f"{said}; with torque limits {held.motors:g} times as large, one holds all of it"

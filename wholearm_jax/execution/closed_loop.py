@@ -64,6 +64,11 @@ class ControlledMotor:
         self._pending: deque[tuple[int, np.ndarray]] = deque()
         self._end: int | None = None
 
+    @property
+    def phase(self) -> int:
+        """The number of the phase that the controller is in."""
+        return 0 if self._state is None else self._state.phase
+
     def __call__(self, k: int, angles: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"] | None:
         """Return the torque of time step `k`, before which the joints stand at `angles`; None once the plan is over."""
         if k % self._every == 0:

@@ -15,7 +15,7 @@ against the end of the perturbed object's own path from where it was laid.
 
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -44,6 +44,7 @@ from wholearm_jax.execution.executions import (
     start_of,
     target_of,
 )
+from wholearm_jax.execution.least_forces import PlannedContacts, least_force, planned_contacts
 from wholearm_jax.execution.link_meetings import unexpected_meetings
 from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
 from wholearm_jax.execution.pushes import Push
@@ -78,9 +79,11 @@ class PerturbedRun:
     """One execution: factors and shifts drawn, where the object ended, and what that counts as.
 
     `ending` is judged by the end of the unperturbed plan, `own_ending` by `own_target`, the end of the perturbed
-    object's own path, None where that has none.
+    object's own path, None where that has none. `scene` is the perturbed one, from where the object was laid, and
+    `least_force` [N] that of the contacts that held the object on its way (`least_forces.least_force`).
     """
 
+    scene: Scene
     friction: Float[np.ndarray, "3"]
     mass: float
     end: Float[np.ndarray, "5"]
@@ -89,6 +92,7 @@ class PerturbedRun:
     ending: ExecutionOutcome
     own_target: Float[np.ndarray, "5"] | None
     own_ending: ExecutionOutcome
+    least_force: float
 
     @property
     def own_position_error(self) -> float:
@@ -126,7 +130,11 @@ class TrialsResult:
         share = 100 * self.successes / len(self.runs)
         span = f"95 % confidence interval {100 * low:.1f} to {100 * high:.1f} %"
         own = f"at the ends of their own paths: {self.own_successes}"
-        return f"{self.successes} of {len(self.runs)} perturbed executions succeed: {share:.1f} %, {span}; {own}"
+        kept = sum(run.least_force > 0 for run in self.runs)
+        return (
+            f"{self.successes} of {len(self.runs)} perturbed executions succeed: {share:.1f} %, {span}; {own};"
+            f" all contacts kept on the way: {kept}"
+        )
 
 
 class Copy(NamedTuple):
@@ -197,11 +205,14 @@ def run_copies(
         (build_mujoco_model(one.scene, step, softness), path.start) for one, path in zip(copies, laid, strict=True)
     )
     pushed = [one.pushes for one in copies]
-    found = rollout_in_parallel(models, drives, max(1, min(workers or os.cpu_count() or 1, len(copies))), pushed)
+    workers, contacts = max(1, min(workers or os.cpu_count() or 1, len(copies))), planned_contacts(prediction.scene)
     runs = []
-    for one, own, (end, creep, met) in zip(copies, laid, found, strict=True):
-        targets, reached = (target, own.target), (end, creep, unexpected_meetings(prediction, met))
-        runs.append(_summary(prediction.scene, one.scene, targets, reached, tolerance))
+    for one, own, reached in zip(
+        copies, laid, rollout_in_parallel(models, drives, workers, pushed, contacts), strict=True
+    ):
+        changed = eqx.tree_at(lambda s: s.start, one.scene, jnp.asarray(own.start))
+        reached = reached._replace(met=unexpected_meetings(prediction, reached.met))
+        runs.append(_summary(prediction.scene, changed, (target, own.target), reached, tolerance))
         if callback is not None:
             callback(runs[-1])
     return tuple(runs)
@@ -292,37 +303,58 @@ def lay_in_hand(prediction: Result, scene: Scene, start) -> OwnPath:
     )
 
 
+class Reached(NamedTuple):
+    """Where an execution ended: its last configuration, how far contacts crept, what met, and the least force."""
+
+    z: Float[np.ndarray, "5"]
+    creep: float
+    met: Collection[str]
+    least_force: float
+
+
 def rollout_in_parallel(
     models: Iterable[tuple[MujocoModel, Float[np.ndarray, "5"]]],
     drives: Iterable,
     workers: int,
     pushes: Iterable[Sequence[Push]] = itertools.repeat(()),
-) -> Iterator[tuple[Float[np.ndarray, "5"], float, dict[str, float]]]:
-    """Yield where free bodies end, driven from rest at their starts, how far contacts crept, and what links met.
+    contacts: PlannedContacts = PlannedContacts((), np.zeros(0)),
+) -> Iterator[Reached]:
+    """Yield where free bodies end, driven from rest at their starts.
 
-    `drives` are the torques of each, or its motor; `pushes` act on each beside them.
+    `drives` are the torques of each, or its motor; `pushes` act on each beside them. The least force is that of
+    `contacts`.
     """
-    each = (delayed(_end)(*model, motor, pushed) for model, motor, pushed in zip(models, drives, pushes, strict=False))
-    return Parallel(n_jobs=workers, return_as="generator")(each)  # pyright: ignore[reportReturnType]
+    each = zip(models, drives, pushes, strict=False)
+    tasks = (delayed(_drive)(*model, motor, pushed, contacts) for model, motor, pushed in each)
+    return Parallel(n_jobs=workers, return_as="generator")(tasks)  # pyright: ignore[reportReturnType]
 
 
-def _end(bodies: MujocoModel, start, torques, pushes) -> tuple[Float[np.ndarray, "5"], float, dict[str, float]]:
-    z, _, _, creep, met = rollout(bodies, start, torques, pushes)
-    return z[-1], creep, met
+def _drive(bodies: MujocoModel, start, torques, pushes, contacts: PlannedContacts) -> Reached:
+    step, phases = bodies.model.opt.timestep, []
+
+    def motor(k: int, angles):
+        torque = torques(k, angles)
+        phases.append(torques.phase)
+        return torque
+
+    z, z_dot, forces, creep, met = rollout(bodies, start, motor if callable(torques) else torques, pushes)
+    phase = (
+        np.array(phases[:-1]) if callable(torques) else np.searchsorted(contacts.ends, np.arange(len(torques)) * step)
+    )
+    least = least_force(contacts, bodies.names, phase, z_dot[:-1, 3:], forces[:-1, :, 0], step)
+    return Reached(z[-1], creep, met, least)
 
 
-def _summary(scene: Scene, changed: Scene, targets, reached, tolerance: Tolerance) -> PerturbedRun:
-    """Judge where a perturbed object ended by `targets`: the unperturbed plan's end and its own path's, or None.
-
-    `reached` is where it ended, how far contacts crept, and what links met.
-    """
-    (end, creep, met), (target, own) = reached, targets
+def _summary(scene: Scene, changed: Scene, targets, reached: Reached, tolerance: Tolerance) -> PerturbedRun:
+    """Judge where a perturbed object ended by `targets`: the unperturbed plan's end and its own path's, or None."""
+    end, (target, own) = reached.z, targets
+    goals = [np.full(5, np.inf) if goal is None else goal for goal in targets]
     ending, own_ending = (
-        assess_execution(changed, end, np.full(5, np.inf) if goal is None else goal, tolerance, creep, met)[0]
-        for goal in targets
+        assess_execution(changed, end, goal, tolerance, reached.creep, reached.met)[0] for goal in goals
     )
     was, now = (np.asarray(one.object.friction) for one in (scene, changed))
     return PerturbedRun(
+        scene=changed,
         friction=np.where(was > 0, now / np.where(was > 0, was, 1.0), 1.0),
         mass=float(changed.object.mass / scene.object.mass),
         end=end,
@@ -331,4 +363,5 @@ def _summary(scene: Scene, changed: Scene, targets, reached, tolerance: Toleranc
         ending=ending,
         own_target=own,
         own_ending=own_ending,
+        least_force=reached.least_force,
     )

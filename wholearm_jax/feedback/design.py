@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from wholearm_jax.core import Status, require_positive
 from wholearm_jax.feedback.controller import Controller, PhaseLaw
-from wholearm_jax.feedback.path_table import PathTable, PathTerms, path_terms, tabulate_path
+from wholearm_jax.feedback.path_table import PathTable, PathTerms, path_terms, tabulate_path, terms_of_other_shape
 from wholearm_jax.feedback.reference_motion import (
     PASSING,
     ReferenceMotion,
@@ -65,8 +65,8 @@ def feedback(
     """Design a closed-loop law for a plan (`docs/feedback.md`).
 
     Torques and gains are chosen for the largest least force over the scene and those whose friction, link by link, and
-    mass are at the ends of their ranges. Each phase's `margin` says how large it is; where it is negative, some
-    object of the set cannot be held by this law.
+    mass are at the ends of their ranges, and, where a `shape` is given, over drawn parts of other shape. Each phase's
+    `margin` says how large it is; where it is negative, some object of the set cannot be held by this law.
 
     Args:
         scene: Scene with its plan.
@@ -77,8 +77,9 @@ def feedback(
         stiffness: Natural frequency `w` of the loop [1/s].
         integral: Rate of its integral part [1/s].
         observer: Rate of the filter for place and speed [1/s].
-        shape: Half width of the vertices' coordinates [m], unless given 1 % of the object's radius. Phases that end at
-            a stop approach it slowly from where it may be, first, and go on to where it may be, last.
+        shape: Half width of the vertices' coordinates [m] of parts that have to be held, too. Phases that end at a stop
+            approach it slowly from where that of such a part may be, first, and go on to where it may be, last; for
+            that alone it is 1 % of the object's radius unless given.
         own_motion: Follow the schedule's own motion, instead of the smooth one with the largest margin.
 
     Returns:
@@ -103,6 +104,9 @@ def feedback(
     drawn = [trace(other) for other in shapes]
     approaches = _approaches(scene, traces[0], tables, drawn)
     terms = [[path_terms(paths[k].dynamics, table) for paths in traces] for k, table in enumerate(tables)]
+    if shape:
+        for k, table in enumerate(tables):
+            terms[k] += [terms_of_other_shape(paths[k].dynamics, table) for paths in drawn if has_paths(paths[: k + 1])]
     either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
     limit = RESERVE * np.asarray(scene.hand.torque_limit)
     objects = [*zip(scenes, traces, strict=True), *zip(shapes, drawn, strict=True)]

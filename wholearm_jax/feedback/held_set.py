@@ -7,7 +7,7 @@ import equinox as eqx
 from wholearm_jax.feedback.design import feedback
 from wholearm_jax.model import Scene, TorqueSchedule
 
-SHARES = (0.75, 0.5, 0.25)  # of the half widths of friction and mass that are tried
+SHARES = (0.75, 0.5, 0.25)  # of the half widths that are tried
 MOTORS = (1.5, 2.0, 3.0)  # torque limits that are tried, over the hand's
 
 
@@ -33,7 +33,8 @@ def held_set(
 
     def holds(share: float, motors: float) -> bool:
         hand = eqx.tree_at(lambda s: s.hand.torque_limit, scene, motors * scene.hand.torque_limit)
-        return feedback(hand, schedule, friction=share * friction, mass=share * mass, shape=shape).margin > 0
+        smaller = shape and share * shape
+        return feedback(hand, schedule, friction=share * friction, mass=share * mass, shape=smaller).margin > 0
 
     share = next((share for share in SHARES if holds(share, 1.0)), 0.0)
     return HeldSet(share, next((motors for motors in MOTORS if holds(1.0, motors)), None))

@@ -67,6 +67,18 @@ def path_terms(dynamics: PathDynamics, table: PathTable) -> PathTerms:
     return PathTerms(acceleration, slack * speeds[:, None, :])
 
 
+def terms_of_other_shape(dynamics: PathDynamics, table: PathTable) -> PathTerms:
+    """Evaluate the equations of motion of an object of another shape where its path is nearest to a table's nodes.
+
+    Its joint angles follow another curve, of which lengths are taken for those of the table.
+    """
+    own = tabulate_path(dynamics)
+    terms = path_terms(dynamics, own)
+    apart = table.theta[:, None, :] - own.theta[None]
+    nearest = (apart**2).sum(2).argmin(1)
+    return PathTerms(terms.acceleration[nearest], terms.slack[nearest])
+
+
 def _derivative(table: PathTable, values) -> Float[np.ndarray, "nodes"]:
     """Differentiate by `s` within each segment."""
     found = np.empty_like(values)

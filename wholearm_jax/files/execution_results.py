@@ -53,10 +53,18 @@ def execution_summary(execution: Execution, trials: TrialsResult | None = None, 
 
 def _perturbed_row(run: PerturbedRun) -> dict[str, Any]:
     """Return the outcome of one perturbed execution."""
-    drawn = {"friction": run.friction.tolist(), "mass": run.mass, "status": run.ending.value}
-    errors = {"position_error": run.position_error, "angle_error": run.angle_error}
-    own = {"own_path_end": None if run.own_target is None else run.own_target.tolist()}
-    return null_for_undefined(drawn | errors | {"end": run.end.tolist(), "own_path_status": run.own_ending.value} | own)
+    row = {
+        "friction": run.friction.tolist(),
+        "mass": run.mass,
+        "status": run.ending.value,
+        "position_error": run.position_error,
+        "angle_error": run.angle_error,
+        "end": run.end.tolist(),
+        "own_path_status": run.own_ending.value,
+        "own_path_end": None if run.own_target is None else run.own_target.tolist(),
+        "least_force": run.least_force,
+    }
+    return null_for_undefined(row)
 
 
 def write_execution(execution: Execution, path: str | Path, samples: int = 201) -> None:
