@@ -28,8 +28,8 @@ class PhaseLaw:
         s_ref: The reference's places [rad].
         v_ref: Its speeds [rad/s].
         torque: Torques of its motion [N m].
-        reach: How far the reference goes on beyond the path's end, to meet the contact that ends the phase [rad]
-            (0: nothing stops the object there, and the phase ends by the clock).
+        reach: How far the reference goes on beyond the path's end, to meet the contact that ends the phase, or to
+            pass the end if the phase flows [rad] (0: nothing stops the object there, and the phase ends by the clock).
         approach: Speed with which it does [rad/s].
         press: Largest acceleration [rad/s^2] that the feedback adds forward within `reach` of the end.
         margin: Least force over the objects that the law was designed for [N], in the model.

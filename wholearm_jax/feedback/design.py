@@ -39,11 +39,12 @@ APPROACH = 0.15  # speed with which, at least [rad/s]
 SLOW_SHARE = 0.25  # of a phase's duration, at most, that the reference takes to cross where stops of other parts may be
 FELT = (0.05, 0.03)  # speed [rad/s] below which an object stands, and for how long [s]
 LONGEST_DELAY = 1.0  # longest time beyond a phase's duration [s]
+UNLIKE = 0.01  # how far a part of other shape may be from the reference's place on its path [rad]
 UNSURE = 0.005  # distance from a corner within which angles do not tell its sides: 3 counts of 4096 a turn [rad]
 
 
 class Approach(NamedTuple):
-    """How a phase comes to its stop: the last part of the path is slow, and the reference reaches beyond it."""
+    """How a phase comes to its end: the last part of the path is slow before a stop, and the reference reaches on."""
 
     slow: float  # [rad]
     speed: float  # [rad/s]
@@ -107,6 +108,7 @@ def feedback(
     if shape:
         for k, table in enumerate(tables):
             terms[k] += [terms_of_other_shape(paths[k].dynamics, table) for paths in drawn if has_paths(paths[: k + 1])]
+            terms[k] += [_displaced(terms[k][0], table, by) for by in (-UNLIKE, UNLIKE)]
     either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
     limit = RESERVE * np.asarray(scene.hand.torque_limit)
     objects = [*zip(scenes, traces, strict=True), *zip(shapes, drawn, strict=True)]
@@ -123,25 +125,41 @@ def feedback(
         stiffness=stiffness,
         integral=integral,
         observer=observer,
-        push=PUSH * float(np.max(scene.hand.torque_limit)),
+        push=_push(scene),
         felt=FELT,
         patience=LONGEST_DELAY,
         torque_limit=np.asarray(scene.hand.torque_limit),
     )
 
 
+def _displaced(terms: PathTerms, table: PathTable, by: float) -> PathTerms:
+    """Return the terms of an object that is elsewhere on its path than where the reference is."""
+    nodes = np.abs(table.s[:, None] + by - table.s).argmin(1)
+    return PathTerms(terms.acceleration[nodes], terms.slack[nodes])
+
+
+def _push(scene: Scene) -> float:
+    """Return the largest torque of the feedback on the way [N m]."""
+    return PUSH * float(np.max(scene.hand.torque_limit))
+
+
 def _approaches(
     scene: Scene, traced: tuple[TracedPhase, ...], tables: list[PathTable], drawn: list[tuple[TracedPhase, ...]]
 ) -> list[Approach | None]:
-    """Say how each phase approaches the stop that ends it; None where nothing stops the object there."""
+    """Say how each phase approaches its end; None where it ends by the clock, as nothing stops the object there.
+
+    One that flows into the next goes on beyond the nominal end, for parts that come to theirs later.
+    """
     found: list[Approach | None] = []
     for phase, path, table, stop in zip(scene.phases, traced, tables, stop_places(tables, drawn), strict=True):
+        if phase.arrive is Arrival.MOVING:
+            found.append(Approach(0.0, 0.0, BEYOND + stop.beyond))
+            continue
         length, duration, slow = float(table.s[-1]), float(phase.duration), stop.before
         speed = max(APPROACH, slow / (SLOW_SHARE * duration))
         if length - slow < speed * (duration - slow / speed):  # it is slow anyway
             slow, speed = 0.0, APPROACH
-        stops = phase.arrive is not Arrival.MOVING and ends_at_stop(scene, phase, path)
-        stays = stops and stays_at_stop(object_at_stop(scene, phase, path))
+        stays = ends_at_stop(scene, phase, path) and stays_at_stop(object_at_stop(scene, phase, path))
         found.append(Approach(slow, speed, max(slow, BEYOND + stop.beyond)) if stays else None)
     return found
 
@@ -239,17 +257,20 @@ def _phase_law(
     """Put the law of phase `k` together, for the nominal object's `terms` and the stops of all objects with paths."""
     phase = scene.phases[k]
     gain = np.stack([np.interp(table.s, motion.s, choice.gain[:, j]) for j in range(2)], axis=1)
-    press = 0.0
-    if approach is not None:
+    flows, press, speed = phase.arrive is Arrival.MOVING, 0.0, APPROACH
+    if approach is not None and not flows:
         stops = [object_at_stop(one, phase, paths[k]) for one, paths in objects if has_paths(paths[: k + 1])]
         limit, either = np.asarray(scene.hand.torque_limit), not phase.has_free_finger
         press, gain_at_stop = choose_push(stops, choice.torque[-1], limit, either_finger=either)
         gain[table.s > table.s[-1] - approach.reach] = gain_at_stop
+        speed = approach.speed
     gain /= (gain * terms.acceleration[:, 3:]).sum(1, keepdims=True)
+    if flows:  # it goes on as it comes, and nothing bounds the feedback more than on the way
+        press, speed = _push(scene) / float(np.abs(gain).max(1).min()), float(motion.v[-1])
     return PhaseLaw(
         name=phase.name,
         contacts=phase.formation.names,
-        flows=phase.arrive is Arrival.MOVING,
+        flows=flows,
         s=table.s,
         theta=table.theta,
         tangent=table.tangent,
@@ -259,7 +280,7 @@ def _phase_law(
         v_ref=motion.v,
         torque=choice.torque,
         reach=approach.reach if approach is not None else 0.0,
-        approach=approach.speed if approach is not None else APPROACH,
+        approach=speed,
         press=press,
         margin=float(choice.margin.min()),
     )
