@@ -13,12 +13,12 @@ import matplotlib
 import mujoco
 import numpy as np
 import pytest
-from matplotlib.path import Path as Outline
 from support import layered, layered_file
 
 import wholearm_jax as wa
 from wholearm_jax.ensembles.summary import wilson_interval
 from wholearm_jax.execution import executions as execution
+from wholearm_jax.execution.acting_pairs import AS_COMPLEX, _tip_touches, choose_pairs
 from wholearm_jax.execution.executions import (
     ExecutionOutcome,
     Tolerance,
@@ -31,9 +31,10 @@ from wholearm_jax.execution.executions import (
     stepper,
     target_of,
 )
-from wholearm_jax.execution.mujoco_model import CONVEX, ContactCompliance, _wedges, build_mujoco_model
+from wholearm_jax.execution.mujoco_model import CONVEX, ContactCompliance, build_mujoco_model
 from wholearm_jax.execution.trials import Amounts, Reached, _draw_scenes, _summary, lay_in_hand, run_trials, start_near
 from wholearm_jax.files.execution_results import _perturbed_row, write_execution
+from wholearm_jax.files.scene_toml import parse, to_dict
 from wholearm_jax.model.kinematics import contact_kinematics, contact_set, normal_jacobian
 from wholearm_jax.model.mechanics import scaled_mechanics
 from wholearm_jax.model.scene import contact_formation, parse_contact, rigid_body
@@ -78,14 +79,56 @@ def test_distances_are_the_c_functions(name, predictions):
     assert len(checked) == len(bodies.names)
 
 
-def test_wedges_lie_inside_a_concave_object_and_apart():
-    corners = np.array([[0, 0], [4, 0], [4, 3], [2, 0.5], [1.8, 3], [0, 3]], float)
-    wedges = [Outline(w) for w in _wedges(corners, 1e-5)]
-    points = np.random.default_rng(0).uniform([-1, -1], [5, 4], (20_000, 2))
-    covered = np.stack([w.contains_points(points) for w in wedges])
-    assert covered.any(1).all()
-    assert covered.sum(0).max() == 1
-    assert Outline(corners).contains_points(points)[covered.any(0)].all()
+def test_a_tip_touches_the_edge_that_it_is_least_deep_in(predictions):
+    """Tips a little inside a concave object, at vertices and far from them, of fingers that come at right angles."""
+    table = to_dict(predictions["heptagon"].scene)
+    upper = [[0.02, 0.015], [0.0, -0.01], [-0.02, 0.015], [-0.021, 0.0]]  # with a notch
+    table["object"]["vertices"] = [[-0.02, -0.015], [0.0, -0.016], [0.02, -0.015], *upper]
+    edges = build_mujoco_model(parse(table), 1e-3).acting.edges
+    vector, rng, count = edges.length * edges.direction, np.random.default_rng(0), len(edges.start)
+    np.testing.assert_array_equal(edges.convex, [True, True, True, False, True, True, True])
+    left_to_others = 0
+    for _ in range(2000):
+        k, finger, share, depth = (
+            rng.integers(count),
+            rng.integers(2),
+            rng.uniform(0.05, 1.0) ** 8,
+            rng.uniform(1e-7, 3e-6),
+        )
+        tip = edges.start[k] + rng.choice([share, 1 - share]) * vector[k] + depth * 1j * edges.direction[k]
+        theta = np.angle(1j * edges.direction[k])
+        lies = edges.joint[finger] + edges.tip[finger] * np.exp(1j * theta) - tip
+        touches = _tip_touches(edges, np.array([lies.real, lies.imag, 0.0, theta, theta]))[finger]
+        place, along_k = (tip - edges.start) / vector, edges.direction / edges.direction[k]
+        others = [j for j, vertex in (((k - 1) % count, k - 1), ((k + 1) % count, k)) if edges.convex[vertex]]
+        less_deep = [
+            0 <= place[j].real <= 1 and 0 < place[j].imag * edges.length[j] < depth and along_k[j].real >= 0
+            for j in others
+        ]
+        assert touches[k] != any(less_deep)
+        left_to_others += any(less_deep)
+    assert left_to_others > 20
+
+
+@pytest.mark.parametrize("away", [1e-6, 5e-6, 50e-6])
+def test_a_tip_beside_a_vertex_is_pushed_along_the_edges_normal(predictions, away):
+    """However near the vertex is: a wedge of the object's shape had room for a tip that has sunk in beside it."""
+    scene, sunk = predictions["heptagon"].scene, 0.8 * away
+    bodies = build_mujoco_model(scene, 2e-4)
+    edges, data = bodies.acting.edges, mujoco.MjData(bodies.model)
+    k = int(np.argmax(edges.length))
+    theta = np.angle(1j * edges.direction[k])
+    tip = edges.start[k] + (away + 1j * sunk) * edges.direction[k]
+    lies = edges.joint[0] + edges.tip[0] * np.exp(1j * theta) - tip
+    data.qpos[:] = lies.real, lies.imag, 0.0, theta, theta - 2.0
+    choose_pairs(bodies.model, bodies.acting, data.qpos)
+    mujoco.mj_forward(bodies.model, data)
+    rows = bodies.pair[data.contact.geom[:, 0], data.contact.geom[:, 1]]
+    at = np.flatnonzero(rows == bodies.names.index(f"finger1:e{k}"))
+    assert len(at) == 1
+    into = data.contact.frame[at[0], :2] * bodies.toward[rows[at[0]]] @ AS_COMPLEX
+    assert abs(into - 1j * edges.direction[k]) < 1e-9
+    assert data.contact.dist[at[0]] == pytest.approx(-sunk, abs=1e-9)
 
 
 def test_free_fall_and_free_fingers(predictions):

@@ -1,10 +1,11 @@
 """Which of MuJoCo's pairs of shapes act: those that stand for a contact, not those that meet a shape's thickness.
 
-Slabs and wedges are thicker than what they stand for. A fingertip touches an edge only where its finger comes from the
-edge's outer side: from the inner side the finger meets an end of the edge first, and a tip that slips past that vertex,
-a little inside it, would catch on the edge. A vertex touches a finger as far as its tip, where the slab goes on: its
-end would push away along the finger a vertex that is less far from the tip than it has sunk in. And a dot of a finger
-meets that face of the other finger on whose side it last was beyond that finger's end, around which it may pass.
+Slabs are thicker and longer than what they stand for. A fingertip touches an edge only between its ends, and where its
+finger comes from the edge's outer side: from the inner side the finger meets an end of the edge first, and a tip that
+slips past that vertex, a little inside it, would catch on the edge. Of two edges at a convex vertex that the tip has
+sunk in, it touches the one in which it is less deep. A vertex touches a finger as far as its tip, where the slab goes
+on: its end would push away along the finger a vertex that is less far from the tip than it has sunk in. And a dot of a
+finger meets that face of the other finger on whose side it last was beyond that finger's end, around which it may pass.
 """
 
 # MuJoCo's names come from a compiled module, which type checkers cannot see into.
@@ -24,11 +25,20 @@ FAR_BELOW = 1e9  # how far below its margin a contact that is left out would act
 
 @dataclass(frozen=True)
 class EdgePairs:
-    """Pairs of a fingertip and an edge: rows of MuJoCo's pairs, fingers (0 or 1), and the edges' outward normals."""
+    """Pairs of each fingertip and each edge: rows of MuJoCo's pairs, and places as `x + iy` [m].
 
-    row: Int[np.ndarray, "edge_pairs"]
-    finger: Int[np.ndarray, "edge_pairs"]
-    normal: Float[np.ndarray, "edge_pairs 2"]  # in the object's frame
+    Edges are in the object's frame; `convex` says it of the vertex at each one's end. Deeper than `depth` [m] a tip is
+    beyond an edge.
+    """
+
+    row: Int[np.ndarray, "fingers edges"]
+    start: Complex[np.ndarray, "edges"]
+    direction: Complex[np.ndarray, "edges"]  # of unit length
+    length: Float[np.ndarray, "edges"]
+    convex: Bool[np.ndarray, "edges"]
+    joint: Complex[np.ndarray, "fingers"]
+    tip: Complex[np.ndarray, "fingers"]  # in the finger's frame, whose x-axis is the finger
+    depth: float
 
 
 @dataclass(frozen=True)
@@ -66,17 +76,28 @@ class ActingPairs:
     gap: float
 
 
-def acting_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid, hand: Hand, gap: float) -> ActingPairs:
+def acting_pairs(
+    model: mujoco.MjModel, names: tuple[str, ...], solid, hand: Hand, gap: float, depth: float
+) -> ActingPairs:
     """Return the pairs of a model, whose contacts are `names`, that act at some times only."""
-    edges, vertices = _edge_pairs(model, names, solid), _vertex_pairs(model, names, solid, hand)
+    edges, vertices = _edge_pairs(model, names, solid, hand, depth), _vertex_pairs(model, names, solid, hand)
     return ActingPairs(edges, vertices, _face_pairs(model, hand), hand, gap)
 
 
-def _edge_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid) -> EdgePairs:
-    corners = solid.vertices[: solid.count]
-    along = np.roll(corners, -1, 0) - corners
-    row, finger, feature = _finger_pairs(model, names, EDGE)
-    return EdgePairs(row, finger, np.stack([along[feature, 1], -along[feature, 0]], axis=1))
+def _edge_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid, hand: Hand, depth: float) -> EdgePairs:
+    start = solid.vertices[: solid.count] @ AS_COMPLEX
+    along = np.roll(start, -1) - start
+    row, finger, _ = _finger_pairs(model, names, EDGE)
+    return EdgePairs(
+        row=np.stack([row[finger == k] for k in range(2)]),
+        start=start,
+        direction=along / np.abs(along),
+        length=np.abs(along),
+        convex=(np.roll(along, -1) / along).imag > 0,
+        joint=np.asarray(hand.joint) @ AS_COMPLEX,
+        tip=np.array([complex(*link_dots(hand, k)[1][1]) for k in range(2)]),
+        depth=depth,
+    )
 
 
 def _vertex_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid, hand) -> VertexPairs:
@@ -113,11 +134,24 @@ def choose_pairs(
     corner = qpos[0] + 1j * qpos[1] + vertices.vertex * np.exp(1j * phi)
     along = ((corner - vertices.joint) * np.exp(-1j * angles)[vertices.finger]).real
     _act(model, acting, vertices.row, along <= vertices.length)
-    normal, toward_tip = acting.edges.normal, angles[acting.edges.finger] - phi
-    from_outside = normal[:, 0] * np.cos(toward_tip) + normal[:, 1] * np.sin(toward_tip) <= 0
-    _act(model, acting, acting.edges.row, from_outside)
+    _act(model, acting, acting.edges.row, _tip_touches(acting.edges, qpos))
     if len(acting.faces.row):
         _choose_faces(model, acting, angles, everywhere)
+
+
+def _tip_touches(edges: EdgePairs, qpos: Float[np.ndarray, "5"]) -> Bool[np.ndarray, "fingers edges"]:
+    """Say which edges the fingertips touch if they come that near."""
+    turn = np.exp(1j * qpos[3:])
+    back = np.exp(-1j * qpos[2])
+    tip = (edges.joint + edges.tip * turn - qpos[0] - 1j * qpos[1]) * back
+    place = (tip[:, None] - edges.start) * edges.direction.conj()  # along the edge, and to the object's inside
+    along, inside = place.real, place.imag
+    from_outside = ((turn * back)[:, None] * edges.direction.conj()).imag >= 0
+    touches = from_outside & (along >= 0) & (along <= edges.length) & (inside < edges.depth)
+    # At a convex vertex that the tip has sunk in from both sides, the less deep one.
+    sunk, after = touches & (inside > 0), np.roll(inside, -1, axis=1)
+    both = sunk & np.roll(sunk, -1, axis=1) & edges.convex
+    return touches & ~(both & (inside > after)) & ~np.roll(both & (inside <= after), 1, axis=1)
 
 
 def _choose_faces(model: mujoco.MjModel, acting: ActingPairs, angles: Float[np.ndarray, "2"], everywhere: bool) -> None:

@@ -9,9 +9,8 @@ shapes make MuJoCo's distances equal the C-functions:
 - an object vertex and a fingertip are dots, spheres of radius `r`, a hundred-thousandth of the object's;
 - the palm and a finger's contact edge are slabs whose face lies `r` behind the line, so that a dot whose centre is on
   the line touches at gap 0; thick, so that no dot falls through, however soft the contact;
-- an object's edge, for the fingertips, is a wedge on that edge (likewise `r` behind it) with its point inside the
-  object. Wedges do not overlap, so that a concave object needs no decomposition. (MuJoCo keeps their corners in single
-  precision: a few nanometres.)
+- an object's edge, for the fingertips, is such a slab, too. Slabs reach beyond their edges, and a tip near a vertex
+  touches that of the edge on which it is.
 
 The links are bodies among themselves, too: fingertips and joints are dots against the other finger, and fingertips
 against the palm, without friction; ranges are joint limits. Layered fingers do not meet.
@@ -58,6 +57,7 @@ PAIR_DISTANCE = (
 )
 CORNER = 2e-3  # by how much finger and palm go on beyond the joint, and the finger beyond its tip [object radii]
 LINK_GIVE = 1e-3  # how far contacts between links give way, over those with the object
+EDGE_DEPTH = 0.02  # how deep a fingertip may sink in an edge [object radii]
 HALF_SPACE_DEPTH = 0.2  # slabs, and all shapes in depth [object radii]
 
 
@@ -139,7 +139,7 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
         pair[first, second] = pair[second, first] = len(rows) + link_meetings.index(name)
     link = np.array([parse_contact(name)[0] for name in rows])
     inertia = np.array([solid.mass, solid.mass, solid.inertia, *hand.inertia])
-    acting = acting_pairs(model, tuple(rows), solid, hand, PAIR_DISTANCE * size)
+    acting = acting_pairs(model, tuple(rows), solid, hand, PAIR_DISTANCE * size, EDGE_DEPTH * size)
     choose_pairs(model, acting, np.asarray(scene.start), everywhere=True)
     return MujocoModel(
         model=model,
@@ -191,17 +191,21 @@ def _add_body(spec, name, position, inertia, mass):
 
 
 def _add_object(spec, solid, size):
-    """The object: slides, hinge, a dot on each vertex and a wedge on each edge."""
+    """The object: slides, hinge, a dot on each vertex and a slab on each edge."""
     body_ = _add_body(spec, "object", [0, 0, 0], solid.inertia, solid.mass)
     for name, kind, axis in (("x", "SLIDE", [1, 0, 0]), ("y", "SLIDE", [0, 1, 0]), ("phi", "HINGE", [0, 0, 1])):
         body_.add_joint(name=name, type=getattr(mujoco.mjtJoint, f"mjJNT_{kind}"), axis=axis)
     corners = solid.vertices[: solid.count]
     for k, corner in enumerate(corners):
         _add_geom(body_, f"v{k}", "SPHERE", [POINT_RADIUS * size, 0, 0], [*corner, 0])
-    for k, wedge in enumerate(_wedges(corners, POINT_RADIUS * size)):
-        points = [[*p, side * HALF_SPACE_DEPTH * size / 2] for side in (-1, 1) for p in wedge]
-        spec.add_mesh(name=f"e{k}", uservert=np.ravel(points))
-        _add_geom(body_, f"e{k}", "MESH", [0, 0, 0], [0, 0, 0], meshname=f"e{k}")
+    thick, dot, beyond = HALF_SPACE_DEPTH * size, POINT_RADIUS * size, EDGE_DEPTH * size
+    for k, (start, end) in enumerate(zip(corners, np.roll(corners, -1, 0), strict=True)):
+        along = end - start
+        length, angle = np.hypot(*along), np.arctan2(along[1], along[0])
+        middle = (start + end) / 2 + (dot + thick / 2) * np.array([-along[1], along[0]]) / length
+        half = [length / 2 + 2 * beyond, thick / 2, thick / 2]
+        turn = [np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)]
+        _add_geom(body_, f"e{k}", "BOX", half, [*middle, 0], quat=turn)
 
 
 def _add_hand(spec, hand, size, compliance):
@@ -302,26 +306,3 @@ def _add_link_pairs(spec, hand, size, timestep, softness) -> list[tuple[str, str
             **_gives_way(softness, timestep),
         )
     return meetings
-
-
-def _wedges(corners, behind):
-    """Triangles `(edges, 3, 2)` on an object's edges, `behind` them, with their points inside and free of each other.
-
-    The point stands over the edge's middle, below both ends' bisectors and clear of every other corner.
-    """
-    after, count = np.roll(corners, -1, 0), len(corners)
-    along = after - corners
-    length = np.hypot(*along.T)
-    along = along / length[:, None]
-    inward = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    turn = np.arctan2(np.sum(inward * np.roll(along, -1, 0), 1), np.sum(along * np.roll(along, -1, 0), 1))
-    end = np.minimum((np.pi - turn) / 2, 1.0)  # half the inner angle at each edge's end
-    half = np.minimum(end, np.roll(end, 1))
-    height = 0.5 * np.tan(half) * length / 2
-    for k in range(count):
-        others = np.delete(corners, [k, (k + 1) % count], axis=0) - corners[k]
-        over = (others @ inward[k] > 0) & (others @ along[k] >= 0) & (others @ along[k] <= length[k])
-        height[k] = min([height[k], *(0.5 * others[over] @ inward[k])])
-    base = behind * inward
-    middle = (corners + after) / 2
-    return np.stack([corners + base, after + base, middle + height[:, None] * inward], axis=1)
