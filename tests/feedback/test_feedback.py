@@ -12,7 +12,7 @@ from reference.feedback_law import Law
 import wholearm_jax as wa
 from wholearm_jax.core.errors import BadInput
 from wholearm_jax.execution import Amounts, ExecutionOutcome, Hardware, execute, run_trials
-from wholearm_jax.feedback import HeldSet, begin, held_set, step
+from wholearm_jax.feedback import HeldSet, PassingImpulse, begin, held_set, step
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +131,10 @@ def test_a_law_is_written_only_where_it_holds_the_whole_set(least, code, wholear
         asked.append(uncertain)
         return replace(controller, phases=tuple(replace(phase, margin=least) for phase in controller.phases))
 
-    monkeypatch.setattr(importlib.import_module("wholearm_jax.feedback"), "feedback", design)
-    monkeypatch.setattr(importlib.import_module("wholearm_jax.feedback"), "held_set", lambda *_, **__: HeldSet(0.5, 2))
+    package = importlib.import_module("wholearm_jax.feedback")
+    monkeypatch.setattr(package, "feedback", design)
+    monkeypatch.setattr(package, "held_set", lambda *_, **__: HeldSet(0.5, 2))
+    monkeypatch.setattr(package, "least_passing_impulse", lambda *_: PassingImpulse(1, "palm:v4", -0.021))
     robust = ("--robust", "friction=10%", "--robust", "vertices=0.0002")
     status, _, err = wholearm("optimise", "heptagon", "--feedback", *robust, "--knots", "11", "--out", tmp_path)
     assert status == code
@@ -142,6 +144,9 @@ def test_a_law_is_written_only_where_it_holds_the_whole_set(least, code, wholear
     assert ("would open" in err) == (code == 1)
     smaller = "a law holds --robust vertices=0.0001 --robust friction=5%; with torque limits 2 times as large"
     assert (smaller in err) == (code == 1)
+    assert (
+        "'flip right': for some objects of the set the impulse at its beginning pulls at palm:v4, 2.1 %" in err
+    ) == (code == 0)
 
 
 @pytest.mark.slow

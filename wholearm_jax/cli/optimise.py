@@ -109,7 +109,7 @@ def _design(optimum, uncertain: dict[str, float], as_json: bool):
         uncertain: half widths of friction, mass and vertices.
         as_json: whether standard output is for JSON alone.
     """
-    from wholearm_jax.feedback import feedback, held_set
+    from wholearm_jax.feedback import feedback, held_set, least_passing_impulse
 
     objects: dict[str, Any] = {name: uncertain.get(name, 0.0) for name in ("friction", "mass")}
     objects["shape"] = uncertain.get("vertices")
@@ -118,12 +118,23 @@ def _design(optimum, uncertain: dict[str, float], as_json: bool):
         print(f"{phase.name}: closed loop, least force {phase.margin:.4g} N over all objects of the set")
     weakest = min(controller.phases, key=lambda phase: phase.margin)
     if weakest.margin > 0:
+        _note_impulse(optimum.scene, least_passing_impulse(optimum.scene, objects["friction"], objects["mass"]))
         return controller
     note(
         f"no controller.json: in '{weakest.name}' a contact of some object of the set would open, least force "
         f"{weakest.margin:.3g} N; {_what_holds(held_set(optimum.scene, optimum.torque, **objects), uncertain)}"
     )
     return None
+
+
+def _note_impulse(scene, impulse) -> None:
+    """Say where an impulse pulls between phases that follow one another without a stop."""
+    if impulse is not None and impulse.share < 0:
+        note(
+            f"'{scene.phases[impulse.phase].name}': for some objects of the set the impulse at its beginning pulls at"
+            f" {impulse.contact}, {-100 * impulse.share:.2g} % of the largest: the contact opens for an instant,"
+            " which `check` counts as lost"
+        )
 
 
 def _what_holds(held, uncertain: dict[str, float]) -> str:
