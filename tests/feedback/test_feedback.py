@@ -144,9 +144,8 @@ def test_a_law_is_written_only_where_it_holds_the_whole_set(least, code, wholear
     assert ("would open" in err) == (code == 1)
     smaller = "a law holds --robust vertices=0.0001 --robust friction=5%; with torque limits 2 times as large"
     assert (smaller in err) == (code == 1)
-    assert (
-        "'flip right': for some objects of the set the impulse at its beginning pulls at palm:v4, 2.1 %" in err
-    ) == (code == 0)
+    pulls = "'flip right': for some objects of the set the impulse at its beginning pulls at palm:v4, 2.1 % of the"
+    assert (pulls in err) == (code == 0)
 
 
 @pytest.mark.slow
