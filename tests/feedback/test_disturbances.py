@@ -83,7 +83,7 @@ def test_maps_of_friction_and_start_change_one_thing_a_column(prediction, contro
 
 def test_the_figure_has_a_mark_for_every_execution(prediction, controller):
     found = push_map(prediction, "phi", (2e-3, 0.02), (0.6,), controller=controller, workers=2)
-    ax = plot_disturbance_map(found)
+    ax = plot_disturbance_map(found, plt.figure().gca())
     assert sum(len(marks.get_offsets()) for marks in ax.collections) == 2
     assert ax.get_xlabel() == "begins at [s]"
     plt.close(ax.figure)
