@@ -9,6 +9,7 @@ from wholearm_jax.core import Status
 from wholearm_jax.ensembles import make_ensemble
 from wholearm_jax.execution import ExecutionOutcome, Hardware, execute
 from wholearm_jax.feedback import least_passing_impulse
+from wholearm_jax.files.scene_toml import parse, to_dict
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +28,15 @@ def test_a_law_passes_from_phase_to_phase_in_time():
     done = execute(optimum.result, controller=law, hardware=Hardware())
     assert done.ending is ExecutionOutcome.OK
     assert done.course.time[-1] < 1.2 * float(sum(phase.duration for phase in optimum.scene.phases)) + 0.1
+
+
+def test_after_the_last_phase_there_is_nothing_to_go_on_to():
+    table = to_dict(wa.load("passage"))
+    table["phase"][-1]["arrive"] = "moving"
+    scene = parse(table)
+    law = wa.feedback(scene, wa.optimise(scene).torque, friction=0.0)
+    assert [phase.flows for phase in law.phases] == [True, True, True]
+    assert [phase.reach > 0 for phase in law.phases] == [True, True, False]
 
 
 def test_a_law_for_other_shapes_holds_objects_beside_the_reference(flight):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from wholearm_jax.core import Status, require_positive
 from wholearm_jax.feedback.controller import Controller, PhaseLaw
@@ -134,8 +134,12 @@ def feedback(
 
 def _displaced(terms: PathTerms, table: PathTable, by: float) -> PathTerms:
     """Return the terms of an object that is elsewhere on its path than where the reference is."""
-    nodes = np.abs(table.s[:, None] + by - table.s).argmin(1)
-    return PathTerms(terms.acceleration[nodes], terms.slack[nodes])
+    return terms.at(_nearest(table, table.s + by))
+
+
+def _nearest(table: PathTable, places: Float[np.ndarray, "places"]) -> Int[np.ndarray, "places"]:
+    """Return the nodes next to places on a path."""
+    return np.abs(places[:, None] - table.s).argmin(1)
 
 
 def _push(scene: Scene) -> float:
@@ -148,12 +152,14 @@ def _approaches(
 ) -> list[Approach | None]:
     """Say how each phase approaches its end; None where it ends by the clock, as nothing stops the object there.
 
-    One that flows into the next goes on beyond the nominal end, for parts that come to theirs later.
+    One that flows into the next goes on beyond the nominal end, for parts that come to theirs later; after the last
+    phase there is nothing to go on to.
     """
     found: list[Approach | None] = []
     for phase, path, table, stop in zip(scene.phases, traced, tables, stop_places(tables, drawn), strict=True):
         if phase.arrive is Arrival.MOVING:
-            found.append(Approach(0.0, 0.0, BEYOND + stop.beyond))
+            follows = phase is not scene.phases[-1]
+            found.append(Approach(0.0, 0.0, BEYOND + stop.beyond) if follows else None)
             continue
         length, duration, slow = float(table.s[-1]), float(phase.duration), stop.before
         speed = max(APPROACH, slow / (SLOW_SHARE * duration))
@@ -223,9 +229,9 @@ def _with_facets(slack: Float[np.ndarray, "nodes facets 5"], count: int) -> Floa
 
 def _choose(every: list[PathTerms], table: PathTable, limit, motion: ReferenceMotion) -> TorqueChoice:
     """Choose torques and gains at the nodes next to a motion's places."""
-    nodes = np.abs(motion.s[:, None] - table.s).argmin(1)
+    nodes = _nearest(table, motion.s)
     facets = max(terms.slack.shape[1] for terms in every)
-    at = [PathTerms(terms.acceleration[nodes], _with_facets(terms.slack[nodes], facets)) for terms in every]
+    at = [PathTerms(terms.acceleration, _with_facets(terms.slack, facets)).at(nodes) for terms in every]
     return choose_torques(at, limit, motion.v, motion.a)
 
 
@@ -258,14 +264,15 @@ def _phase_law(
     phase = scene.phases[k]
     gain = np.stack([np.interp(table.s, motion.s, choice.gain[:, j]) for j in range(2)], axis=1)
     flows, press, speed = phase.arrive is Arrival.MOVING, 0.0, APPROACH
+    reach = approach.reach if approach is not None else 0.0
     if approach is not None and not flows:
         stops = [object_at_stop(one, phase, paths[k]) for one, paths in objects if has_paths(paths[: k + 1])]
         limit, either = np.asarray(scene.hand.torque_limit), not phase.has_free_finger
         press, gain_at_stop = choose_push(stops, choice.torque[-1], limit, either_finger=either)
-        gain[table.s > table.s[-1] - approach.reach] = gain_at_stop
+        gain[table.s > table.s[-1] - reach] = gain_at_stop
         speed = approach.speed
     gain /= (gain * terms.acceleration[:, 3:]).sum(1, keepdims=True)
-    if flows:  # it goes on as it comes, and nothing bounds the feedback more than on the way
+    if approach is not None and flows:  # it goes on as it comes, and nothing bounds the feedback more than on the way
         press, speed = _push(scene) / float(np.abs(gain).max(1).min()), float(motion.v[-1])
     return PhaseLaw(
         name=phase.name,
@@ -279,7 +286,7 @@ def _phase_law(
         s_ref=motion.s,
         v_ref=motion.v,
         torque=choice.torque,
-        reach=approach.reach if approach is not None else 0.0,
+        reach=reach,
         approach=speed,
         press=press,
         margin=float(choice.margin.min()),

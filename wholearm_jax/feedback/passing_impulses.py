@@ -44,7 +44,7 @@ def least_passing_impulse(scene: Scene, friction: float, mass: float = 0.0) -> P
         for k in passed:
             shares = np.asarray(_impulse_shares(traced[k].dynamics, traced[k + 1].dynamics))
             formation = scene.phases[k + 1].formation
-            contact = formation.names[int(np.cumsum(~np.asarray(formation.tangential))[shares.argmin()]) - 1]
+            contact = formation.names[formation.contact_of_row[int(shares.argmin())]]
             found.append(PassingImpulse(k + 1, contact, float(shares.min())))
     return min(found, key=lambda one: one.share, default=None)
 

@@ -30,6 +30,10 @@ class PathTerms(NamedTuple):
     acceleration: Float[np.ndarray, "nodes 5"]  # [rad/s^2]
     slack: Float[np.ndarray, "nodes facets 5"]  # [N]
 
+    def at(self, nodes: Int[np.ndarray, "places"]) -> "PathTerms":
+        """Take the terms of some nodes."""
+        return PathTerms(self.acceleration[nodes], self.slack[nodes])
+
 
 def tabulate_path(dynamics: PathDynamics, nodes: int = NODES) -> PathTable:
     """Tabulate a path over the length of its curve of joint angles.
@@ -73,10 +77,8 @@ def terms_of_other_shape(dynamics: PathDynamics, table: PathTable) -> PathTerms:
     Its joint angles follow another curve, of which lengths are taken for those of the table.
     """
     own = tabulate_path(dynamics)
-    terms = path_terms(dynamics, own)
     apart = table.theta[:, None, :] - own.theta[None]
-    nearest = (apart**2).sum(2).argmin(1)
-    return PathTerms(terms.acceleration[nearest], terms.slack[nearest])
+    return path_terms(dynamics, own).at((apart**2).sum(2).argmin(1))
 
 
 def _derivative(table: PathTable, values) -> Float[np.ndarray, "nodes"]:
