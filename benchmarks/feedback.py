@@ -96,9 +96,8 @@ def summary(trials: TrialsResult, model) -> dict:
 
 def sampled_margin(scene: wa.Scene, controller: wa.Controller, amounts: Amounts) -> float:
     """Return the least margin under a law of objects from its set: drawn ones, and those at the corners."""
-    spreads = {"friction": f"{100 * amounts.friction!r}%", "mass": f"{100 * amounts.mass!r}%"}
-    spreads |= {"vertices": amounts.geometry} if amounts.geometry else {}
-    ensemble = make_ensemble(scene, {name: each for name, each in spreads.items() if each != "0.0%"}, seed=1)
+    friction, mass = f"{100 * amounts.friction!r}%", f"{100 * amounts.mass!r}%"
+    ensemble = make_ensemble(scene, {"friction": friction, "mass": mass, "vertices": amounts.geometry}, seed=1)
     scenes = [ensemble.draw(k) for k in range(DRAWN)]
     for signs in itertools.product((-1, 1), repeat=4):
         slip = scene.object.friction * (1 + amounts.friction * np.array(signs[:3]))
@@ -154,7 +153,8 @@ def main() -> None:
     for name in options.scenes:
         found[name] = measure_one(name, count, options.workers)
         if not options.quick:  # as they come, for it takes long
-            save("feedback", kept("feedback") | found)
+            results = kept("feedback") | found
+            save("feedback", {name: results[name] for name in SCENES if name in results})
     for name, row in found.items():
         for label in SETS:
             one = row[label]
@@ -163,10 +163,7 @@ def main() -> None:
                 f" checked at {one['relative_rate']:.2f} of open loop's rate"
             )
     if not options.quick:
-        found = kept("feedback") | found
-        found = {name: found[name] for name in SCENES if name in found}
-        save("feedback", found)
-        draw(found).savefig(RESULTS / "feedback.svg", bbox_inches="tight")
+        draw(kept("feedback")).savefig(RESULTS / "feedback.svg", bbox_inches="tight")
 
 
 if __name__ == "__main__":

@@ -198,14 +198,14 @@ def _add_object(spec, solid, size):
     corners = solid.vertices[: solid.count]
     for k, corner in enumerate(corners):
         _add_geom(body_, f"v{k}", "SPHERE", [POINT_RADIUS * size, 0, 0], [*corner, 0])
-    thick, dot, beyond = HALF_SPACE_DEPTH * size, POINT_RADIUS * size, EDGE_DEPTH * size
+    thick, dot, beyond = (
+        HALF_SPACE_DEPTH * size,
+        POINT_RADIUS * size,
+        2 * EDGE_DEPTH * size,
+    )  # ends are farther than deep
     for k, (start, end) in enumerate(zip(corners, np.roll(corners, -1, 0), strict=True)):
-        along = end - start
-        length, angle = np.hypot(*along), np.arctan2(along[1], along[0])
-        middle = (start + end) / 2 + (dot + thick / 2) * np.array([-along[1], along[0]]) / length
-        half = [length / 2 + 2 * beyond, thick / 2, thick / 2]
-        turn = [np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)]
-        _add_geom(body_, f"e{k}", "BOX", half, [*middle, 0], quat=turn)
+        length = float(np.hypot(*(end - start)))
+        _add_slab(body_, f"e{k}", -beyond, length + beyond, dot, 1.0, thick, start, (end - start) / length)
 
 
 def _add_hand(spec, hand, size, compliance):
@@ -244,11 +244,16 @@ def _add_hand(spec, hand, size, compliance):
         motor.gainprm[0], motor.biastype = 1.0, mujoco.mjtBias.mjBIAS_NONE
 
 
-def _add_slab(owner, name, start, end, face, away, thick):
-    """A box along x from `start` to `end`, its face at `y = face`, its body on the side `away` of it."""
-    _add_geom(
-        owner, name, "BOX", [(end - start) / 2, thick / 2, thick / 2], [(start + end) / 2, face + away * thick / 2, 0]
-    )
+def _add_slab(owner, name, start, end, face, away, thick, origin=(0.0, 0.0), direction=(1.0, 0.0)):
+    """A box along a line from `start` to `end`, its face at a height of `face`, its body on the side `away` of it.
+
+    The line begins at `origin` and has a `direction` of unit length.
+    """
+    (x, y), along, height = direction, (start + end) / 2, face + away * thick / 2
+    middle = [origin[0] + along * x - height * y, origin[1] + along * y + height * x, 0]
+    half_angle = np.arctan2(y, x) / 2
+    turn = [np.cos(half_angle), 0.0, 0.0, np.sin(half_angle)]
+    _add_geom(owner, name, "BOX", [(end - start) / 2, thick / 2, thick / 2], middle, quat=turn)
 
 
 def _add_geom(owner, name, kind, size, position, **more):

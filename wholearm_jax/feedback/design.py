@@ -156,10 +156,11 @@ def _approaches(
     phase there is nothing to go on to.
     """
     found: list[Approach | None] = []
-    for phase, path, table, stop in zip(scene.phases, traced, tables, stop_places(tables, drawn), strict=True):
+    rows = zip(scene.phases, traced, tables, stop_places(tables, drawn), strict=True)
+    for k, (phase, path, table, stop) in enumerate(rows):
         if phase.arrive is Arrival.MOVING:
-            follows = phase is not scene.phases[-1]
-            found.append(Approach(0.0, 0.0, BEYOND + stop.beyond) if follows else None)
+            is_last = k == len(tables) - 1
+            found.append(None if is_last else Approach(0.0, 0.0, BEYOND + stop.beyond))
             continue
         length, duration, slow = float(table.s[-1]), float(phase.duration), stop.before
         speed = max(APPROACH, slow / (SLOW_SHARE * duration))
