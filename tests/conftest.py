@@ -1,5 +1,6 @@
 """Every test computes in 64 bits, compiles as the command line does, and leaves room for those that follow."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -12,6 +13,13 @@ from wholearm_jax.core.config import configure
 MAPPED = 30_000  # half of the memory areas that Linux grants a process by default
 
 configure()
+
+
+def pytest_configure(config):
+    """Tests and what they start list fonts anew: a user's list may lack those of a matplotlib that has gone."""
+    cache = getattr(config, "cache", None)  # None where pytest keeps none
+    if cache is not None:
+        os.environ.setdefault("MPLCONFIGDIR", str(cache.mkdir("matplotlib")))
 
 
 def pytest_collection_modifyitems(items):
