@@ -436,10 +436,15 @@ def waiting(push, first, then):
     return wa.torque_schedule([0.0, 0.2, 0.2, 1.0, 1.0, 2.0], values)
 
 
-@pytest.mark.parametrize("ways", [("squeeze", "squeeze"), ("open", "open"), ("squeeze", "open"), ("open", "squeeze")])
+@pytest.mark.parametrize(
+    "ways", [("squeeze", "squeeze"), ("open", "open"), ("squeeze", "open"), ("open", "squeeze"), ("hardly", "hardly")]
+)
 def test_an_object_waits_only_where_some_forces_hold_it(scene, schedule, ways):
-    """Fingers that open gently do not move the object as far as accelerations tell, but nothing holds it either."""
-    torques = {"squeeze": 0.2 * schedule.values[0], "open": np.array([-0.05, 0.06])}
+    """Fingers that open gently do not move the object as far as accelerations tell, but nothing holds it either.
+
+    With `hardly` any torque, contacts would pull if the object set out backward: less friction than that holds it.
+    """
+    torques = {"squeeze": 0.2 * schedule.values[0], "open": np.array([-0.05, 0.06]), "hardly": np.array([0.005, -0.01])}
     torque, held = waiting(schedule, *(torques[way] for way in ways)), "open" not in ways
     alone = wa.simulate(scene, torque, arrival=ARRIVAL)
     assert alone.phases[0].holds[0].start == 0.0, "it waits"

@@ -1,9 +1,11 @@
 r"""Rest: a proof that friction can hold an object that stands still, without a linear programme.
 
-Of an object that friction keeps at rest the forces are not determined (`holding`). But two sets of them are known,
-those of setting out forward and backward: accelerations `a+ <= 0 <= a-` and forces `c+`, `c-`, linear in the torque.
-The mean of both in which the accelerations cancel balances, and its friction is within every cone if that of `c+` and
-`c-` is. Where it is not, the rest may still be possible: that is for the linear programme to say.
+Of an object that friction keeps at rest the forces are not determined (`holding`). But for each share `k` of its
+friction, with the signs of setting out forward, the equations of motion have an acceleration `a(k)` and forces `c(k)`,
+linear in the torque; and `a(1) <= 0 <= a(-1)` at rest. Between two shares with `a(k1) <= 0 <= a(k0)` the mean of both
+in which the accelerations cancel balances, and its friction is within every cone if that of `c(k0)` and `c(k1)` is.
+The interval of shares is halved until this holds. Where it never does, the rest may still be possible: that is for the
+linear programme to say.
 
 Derivation: section 4 of `docs/derivation.md`.
 """
@@ -26,6 +28,8 @@ from wholearm_jax.model import (
 from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.result import MIN_REST
 from wholearm_jax.simulation import Actuation, Motion, PhaseLoop, torques_of_step
+
+HALVINGS = 20  # of the interval of shares
 
 
 def certify_rest(
@@ -78,17 +82,43 @@ def _certify_interval(
         else _rest_torques(actuation, begin, end)
     )
     corners = torques / mechanics.torque_unit
-    terms = jnp.concatenate([jnp.ones_like(corners[:, :1]), corners], axis=1)
+    still, is_away = jnp.zeros_like(x), mechanics.contacts.is_away
 
-    def within(sign):
-        matrix, right = equations_of_motion(mechanics, z, x, jnp.zeros_like(x), sign * sliding, sign * jnp.sign(x[3:]))
-        solved = fused_matmul(inverse_and_determinant(matrix)[0], right[:, jnp.array([0, 3, 4])])[1:]
-        is_away = mechanics.contacts.is_away
+    def move(share, torque):
+        """Return the acceleration, and whether all forces are within their cones."""
+        matrix, right = equations_of_motion(mechanics, z, x, still, share * sliding, share * jnp.sign(x[3:]))
+        applied = right[:, 0] + fused_matmul(right[:, 3:5], torque)
+        acceleration, *forces = fused_matmul(inverse_and_determinant(matrix)[0], applied)
+        forces = jnp.stack(forces)
         if is_away is not None:  # what holds a finger that is away is no contact's force
-            solved = jnp.where(is_away[:, None], solved[:1], solved)
-        return jax.vmap(lambda one: force_slack(dynamics, fused_matmul(solved, one)))(terms).min() >= 0
+            forces = jnp.where(is_away, forces[0], forces)
+        return acceleration, force_slack(dynamics, forces).min() >= 0
 
-    return jax.lax.map(within, jnp.array([1.0, -1.0])).all()
+    return _is_proved(jax.vmap(move), corners)
+
+
+def _is_proved(moves, torques: Float[Array, "corners 2"]) -> Bool[Array, ""]:
+    """Halve the interval of shares for each torque until the forces at both its ends are within their cones.
+
+    `moves(shares, torques)` are the accelerations, and whether the forces are.
+    """
+
+    def halve(state):
+        count, low, high, _ = state
+        share = (low[0] + high[0]) / 2
+        acceleration, holds = moves(share, torques)
+        low, high = (
+            jax.tree.map(lambda new, old, chosen=chosen: jnp.where(chosen, new, old), (share, holds), end)
+            for chosen, end in ((acceleration > 0, low), (acceleration <= 0, high))
+        )
+        return count + 1, low, high, state[-1] | (low[1] & high[1])
+
+    def continues(state):
+        return (state[0] < HALVINGS) & ~state[-1].all()
+
+    all_of_it = jnp.ones_like(torques[:, 0])
+    low, high = ((share, moves(share, torques)[1]) for share in (-all_of_it, all_of_it))
+    return jax.lax.while_loop(continues, halve, (jnp.asarray(0), low, high, low[1] & high[1]))[-1].all()
 
 
 def _rest_torques(phase_schedule: PhaseSchedule, begin, end) -> Float[Array, "corners 2"]:
