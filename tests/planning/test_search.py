@@ -219,6 +219,21 @@ def test_the_command_writes_a_scene_that_optimise_takes(wholearm, tmp_path):
     assert "write coordinates and values" in err
 
 
+def test_the_command_says_what_may_help_that_has_not_been_tried(wholearm, tmp_path):
+    path = write_scene(tmp_path)
+    command = ("plan", path, "--phases", "1", "--by")
+    code, _, err = wholearm(*command, "x=0.5")
+    assert code == 1
+    assert "what may help: --regrasp-cost 1, so that fingers may go elsewhere; --hand-from length=0.078:0.208" in err
+    assert "--time" not in err, "all moves were tried"
+    assert "edge" not in err, "it is not to turn"
+    code, _, err = wholearm(*command, "phi=-3", "--regrasp-cost", "1", "--time", "0")
+    assert code == 1
+    assert "what may help: --time 60, for a longer search; --hand-from" in err
+    assert "--regrasp-cost" not in err
+    assert "a start on another edge" in err
+
+
 def test_the_command_says_what_a_finger_does_that_moves_alone(wholearm):
     command = ("plan", "heptagon", "--goal", "theta1=0.9", "--regrasp-cost", "0", "--count", "1", "--phases", "1")
     code, out, _ = wholearm(*command)

@@ -85,6 +85,8 @@ def plan(
     if not found.found:
         if not as_json:
             note(f"{scene}: {found.reason}")
+            if hints := _hints(found, loaded, limits, searched_hand=hand_from is not None):
+                note(f"what may help: {'; '.join(hints)}")
         raise typer.Exit(1)
     if optimise:
         _optimise(found.plans[0], folder)
@@ -108,6 +110,24 @@ def _find_hand(scene, text: str, wanted: dict[str, Any], limits: dict[str, Any],
         best = f"joints at -+{found.best.joint:.4g} m, fingers {found.best.length:.4g} m long"
         note(f"--hand-from {text}: {tried}; the best: {best}")
     return found.scene
+
+
+def _hints(found, scene, limits: dict[str, Any], *, searched_hand: bool) -> list[str]:
+    """Say what has not been tried yet that lets more goals be reached; nothing where not even the start is possible."""
+    hints = []
+    if not found.moves and not found.out_of_time:
+        return hints
+    if found.out_of_time:
+        hints.append(f"--time {max(5 * limits['time_limit'], 60):.4g}, for a longer search")
+    if limits["regrasp_cost"] is None:
+        hints.append("--regrasp-cost 1, so that fingers may go elsewhere")
+    if not searched_hand:
+        lengths, joints = ([float(v) for v in row] for row in (scene.hand.length, abs(scene.hand.joint[:, 0])))
+        length, joint = (f"{0.6 * min(row):.3g}:{1.6 * max(row):.3g}" for row in (lengths, joints))
+        hints.append(f"--hand-from length={length},joint={joint}, to search for the hand")
+    if "phi" in found.goal.values:
+        hints.append("a start on another edge and more friction at the palm: what lies flat hardly tips")
+    return hints
 
 
 def _read_ranges(text: str) -> tuple[tuple[float, float], tuple[float, float]]:

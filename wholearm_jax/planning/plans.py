@@ -65,6 +65,7 @@ class PlanningResult:
     nodes: int  # configurations that were expanded
     moves: int  # paths that were traced
     graph: tuple[Edge, ...]  # what the search reached, and from where
+    out_of_time: bool = False  # whether it ended before all moves were tried
 
     @property
     def found(self) -> bool:

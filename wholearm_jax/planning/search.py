@@ -145,7 +145,15 @@ def plan(
         nearer = [move for move in moves if _phases_to_go(search, move.places[1]) < _phases_to_go(search, here) - 1e-6]
         reason = explain_failure(search.goal, here, nearer, search.floor, out_of_time=out_of_time)
     return PlanningResult(
-        start, search.goal, tuple(search.plans), nearest, reason, search.nodes, search.moves, tuple(search.graph)
+        start=start,
+        goal=search.goal,
+        plans=tuple(search.plans),
+        nearest=nearest,
+        reason=reason,
+        nodes=search.nodes,
+        moves=search.moves,
+        graph=tuple(search.graph),
+        out_of_time=out_of_time,
     )
 
 
