@@ -1,6 +1,7 @@
 """Closed-loop laws: their design, their file, an independent reading of both, and executions under other friction."""
 
 import importlib
+import itertools
 import json
 from dataclasses import replace
 
@@ -12,7 +13,8 @@ from reference.feedback_law import Law
 import wholearm_jax as wa
 from wholearm_jax.core.errors import BadInput
 from wholearm_jax.execution import Amounts, ExecutionOutcome, Hardware, execute, run_trials
-from wholearm_jax.feedback import HeldSet, PassingImpulse, begin, held_set, step
+from wholearm_jax.feedback import HeldSet, PassingImpulse, begin, held_set, law_tables, step
+from wholearm_jax.phases import closed_loop_result
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +111,19 @@ def test_the_least_force_under_a_law_is_that_of_the_model(controller, scene):
     assert model.status[0] == 0
     assert run.least_force == pytest.approx(float(model.margin[0]), abs=0.05 * mean)
     assert trials.message.endswith("all contacts kept on the way: 1")
+
+
+def test_the_margin_is_that_of_the_set_under_the_law(controller, scene):
+    """Not only of objects that move as the reference does: in its second phase some are late, at a lesser force."""
+    frictions = [scene.object.friction * np.array(corner) for corner in itertools.product((0.8, 1.2), repeat=3)]
+    tables = law_tables(controller)
+    results = [
+        closed_loop_result(eqx.tree_at(lambda s: s.object.friction, scene, friction), tables) for friction in frictions
+    ]
+    least = np.min([[float(phase.margin) for phase in result.phases] for result in results], axis=0)
+    claimed = np.array([law.margin for law in controller.phases])
+    assert np.all(claimed <= least + 1e-4)
+    np.testing.assert_allclose(claimed, least, rtol=0.01)
 
 
 def test_a_controller_of_another_plan_is_refused(controller):

@@ -32,7 +32,8 @@ class PhaseLaw:
             pass the end if the phase flows [rad] (0: nothing stops the object there, and the phase ends by the clock).
         approach: Speed with which it does [rad/s].
         press: Largest acceleration [rad/s^2] that the feedback adds forward within `reach` of the end.
-        margin: Least force over the objects that the law was designed for [N], in the model.
+        margin: Least force [N] over the objects that the law was designed for, moving as the reference does and as
+            they are simulated under the law.
     """
 
     name: str

@@ -1,6 +1,7 @@
 """Design a controller: the curve of joint angles of each path, a reference along it, its torques, and the gains."""
 
 import itertools
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,6 +10,7 @@ from jaxtyping import Float, Int
 
 from wholearm_jax.core import Status, require_positive
 from wholearm_jax.feedback.controller import Controller, PhaseLaw
+from wholearm_jax.feedback.law_tables import law_tables
 from wholearm_jax.feedback.path_table import PathTable, PathTerms, path_terms, tabulate_path, terms_of_other_shape
 from wholearm_jax.feedback.reference_motion import (
     PASSING,
@@ -28,9 +30,11 @@ from wholearm_jax.phases import (
     hand_over_contacts,
     require_motion,
     simulate,
+    simulate_closed_loop,
     trace,
     trajectory,
 )
+from wholearm_jax.simulation import IntegratorOptions
 
 RESERVE = 0.9  # fraction of the torque limits that the reference's torques and their corrections stay within
 PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
@@ -40,6 +44,7 @@ SLOW_SHARE = 0.25  # of a phase's duration, at most, that the reference takes to
 FELT = (0.05, 0.03)  # speed [rad/s] below which an object stands, and for how long [s]
 LONGEST_DELAY = 1.0  # longest time beyond a phase's duration [s]
 UNLIKE = 0.01  # how far a part of other shape may be from the reference's place on its path [rad]
+SIMULATED_TOLERANCE = 1e-7  # of the integrator: a law makes errors fade
 UNSURE = 0.005  # distance from a corner within which angles do not tell its sides: 3 counts of 4096 a turn [rad]
 
 
@@ -66,8 +71,9 @@ def feedback(
     """Design a closed-loop law for a plan (`docs/feedback.md`).
 
     Torques and gains are chosen for the largest least force over the scene and those whose friction, link by link, and
-    mass are at the ends of their ranges, and, where a `shape` is given, over drawn parts of other shape. Each phase's
-    `margin` says how large it is; where it is negative, some object of the set cannot be held by this law.
+    mass are at the ends of their ranges, and, where a `shape` is given, over drawn parts of other shape. Then all of
+    these are simulated under the law. Each phase's `margin` is the least force of both; where it is negative, some
+    object of the set cannot be held by this law.
 
     Args:
         scene: Scene with its plan.
@@ -119,7 +125,7 @@ def feedback(
         best = int(np.argmax([min(float(c.margin.min()) for c in row) for row in choices]))
         for k, motion, choice in zip(group, options[best], choices[best], strict=True):
             laws.append(_phase_law(scene, k, tables[k], terms[k][0], motion, choice, approaches[k], objects))
-    return Controller(
+    controller = Controller(
         title=scene.title,
         phases=tuple(laws),
         stiffness=stiffness,
@@ -130,6 +136,20 @@ def feedback(
         patience=LONGEST_DELAY,
         torque_limit=np.asarray(scene.hand.torque_limit),
     )
+    return _with_simulated_margins(controller, objects if shape else objects[: len(scenes)])
+
+
+def _with_simulated_margins(controller: Controller, objects: list[tuple[Scene, tuple[TracedPhase, ...]]]) -> Controller:
+    """Lower the margins of a controller to those of objects that are simulated under it.
+
+    The choice of torques lets every object move as the reference does; in closed loop one of other friction is late,
+    or early, until the loop has made up for it.
+    """
+    tables, options = law_tables(controller), IntegratorOptions(tolerance=SIMULATED_TOLERANCE)
+    runs = [simulate_closed_loop(scene, tables, paths, options) for scene, paths in objects if has_paths(paths)]
+    least = [min(float(run[k].margin_result.margin) for run in runs) for k in range(len(controller.phases))]
+    phases = zip(controller.phases, least, strict=True)
+    return replace(controller, phases=tuple(replace(law, margin=min(law.margin, margin)) for law, margin in phases))
 
 
 def _displaced(terms: PathTerms, table: PathTable, by: float) -> PathTerms:
