@@ -1,5 +1,6 @@
 """From a drawing to a scene that `plan` takes: the file, its start, and what the command says."""
 
+import re
 import sys
 
 import ezdxf
@@ -50,6 +51,24 @@ def test_a_box_from_a_drawing_rests_flush_on_the_palm(box, monkeypatch, capsys):
     assert scene.phases == ()
     made = wa.scene_from_outline(wa.read_outline("box.dxf"), mass=0.1, friction=0.2)
     np.testing.assert_array_equal(np.asarray(made.start), np.asarray(scene.start))
+
+
+def test_a_part_with_curves_may_have_fewer_vertices(box, monkeypatch, capsys):
+    """A rounded corner is many vertices, which a plan passes one after the other; with the tolerance named they go."""
+    corner = [(0, 0, 0), (60, 0, 0), (60, 25, np.tan(np.pi / 8)), (45, 40, 0), (0, 40, 0)]
+    document = ezdxf.new()
+    document.header["$INSUNITS"] = 4
+    document.modelspace().add_lwpolyline(corner, format="xyb", close=True)
+    document.saveas("rounded.dxf")
+    assert command(monkeypatch, "rounded.dxf") == 0
+    out, err = capsys.readouterr()
+    many, few = (int(word) for word in re.search(r"(\d+) vertices, (\d+) with --tolerance 0.5", err).groups())
+    assert f", {many} vertices" in out
+    assert command(monkeypatch, "rounded.dxf", "--tolerance", "0.5", "--out", "coarse.toml") == 0
+    out, err = capsys.readouterr()
+    assert f", {few} vertices" in out
+    assert "--tolerance" not in err
+    assert few < 0.7 * many
 
 
 def test_each_link_has_its_friction(box, monkeypatch, capsys):

@@ -8,6 +8,7 @@ import typer
 from wholearm_jax.cli.arguments import AsJson, BadInput, note, refuse_unwritable
 from wholearm_jax.cli.tables import Column, print_json, print_table
 
+MANY_VERTICES, COARSER, FEWER = 12, 10, 0.7  # of an outline; how much coarser a tolerance, for which share of vertices
 UNIT_HELP = "Of the drawing's lengths: mm, cm, m, in, px ...; its own unless given."
 
 
@@ -56,12 +57,32 @@ def scene(
         write_atomically(path, scene_text(tables, lines))
     if chosen.skipped:
         note(f"{drawing}: passed over: {', '.join(chosen.skipped)}")
+    _note_many_vertices(drawing, unit, tolerance, len(chosen.vertices), outline)
     if as_json:
         print_json({"scene": str(path)} | tables)
         return
     print("\n".join(lines))
     span = 2 * tables["hand"]["finger1"]["joint"][0]
     print(f"-> {path}; go on with: wholearm plan {path} --by x={-(span - choice.width) / 4:.1g}")
+
+
+def _note_many_vertices(drawing: Path, unit: str | None, tolerance: float, count: int, outline: int | None) -> None:
+    """Say how few vertices would do with a coarser tolerance, where curves make for many."""
+    from wholearm_jax.core import SceneError
+    from wholearm_jax.files import read_outlines
+
+    if count <= MANY_VERTICES:
+        return
+    coarser = COARSER * tolerance
+    try:
+        fewer = len(read_outlines(drawing, unit=unit, tolerance=1e-3 * coarser)[(outline or 1) - 1].vertices)
+    except (SceneError, IndexError):  # nothing of the part would be left
+        return
+    if fewer < FEWER * count:
+        note(
+            f"{count} vertices, {fewer} with --tolerance {coarser:g}: "
+            "a plan passes a curve vertex by vertex, each in a phase of its own"
+        )
 
 
 def _read_friction(text: str) -> float | dict[str, float]:
