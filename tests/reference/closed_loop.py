@@ -2,7 +2,7 @@
 
 Nothing here is shared with the package: the law's numbers are those of `controller.json`, the mechanics `unreduced`'s.
 The state is `(z, z_dot, s, v, i)`; sampling becomes the limit of short periods, in which the observer of the page is
-`ds/dt = v + 2 w_o e`, `dv/dt = w_o^2 e`.
+`ds/dt = v + 2 w_o e`, `dv/dt = dv_ref/dt + w_o^2 e`.
 """
 
 import numpy as np
@@ -42,7 +42,9 @@ class ClosedLoop:
 
     def observe(self, u, angles, memory):
         e, w = project(self.p, angles, memory[0]) - memory[0], self.c["observer"]
-        return np.array([memory[1] + 2 * w * e, w**2 * e, self.act(u, memory)[1]])
+        time, v_ref = np.array(self.p["time"]), np.array(self.p["v_ref"])
+        faster = (np.diff(v_ref) / np.diff(time))[min(max(np.sum(u > time) - 1, 0), len(time) - 2)] * (u <= time[-1])
+        return np.array([memory[1] + 2 * w * e, faster + w**2 * e, self.act(u, memory)[1]])
 
     def field(self, u, y):
         z, z_dot, memory = y[:5], y[5:10], y[10:]

@@ -21,10 +21,11 @@ class Law:
             self.s = self.o = project(c["phases"][0], angles, 0.0)
         h, w, p = t - self.t, c["stiffness"], c["phases"][self.n]
         # Observe.
-        r, predicted = np.exp(-c["observer"] * h), self.s + h * self.v
+        faster = np.diff(np.interp([self.t - self.t0, t - self.t0], p["time"], p["v_ref"]))[0]
+        r, predicted = np.exp(-c["observer"] * h), self.s + h * (self.v + faster / 2)
         e = project(p, angles, predicted) - predicted
         self.s = predicted + (1 - r**2) * e
-        self.v += (1 - r) ** 2 * e / h if h > 0 else 0.0
+        self.v += faster + ((1 - r) ** 2 * e / h if h > 0 else 0.0)
         self.still = self.still + h if self.pressed and abs(self.v) < c["felt"][0] else 0.0
         # Change the phase.
         u, length, duration = t - self.t0, p["s"][-1], p["time"][-1]

@@ -43,7 +43,7 @@ APPROACH = 0.15  # speed with which, at least [rad/s]
 SLOW_SHARE = 0.25  # of a phase's duration, at most, that the reference takes to cross where stops of other parts may be
 FELT = (0.05, 0.03)  # speed [rad/s] below which an object stands, and for how long [s]
 LONGEST_DELAY = 1.0  # longest time beyond a phase's duration [s]
-UNLIKE = 0.01  # how far a part of other shape may be from the reference's place on its path [rad]
+ASIDE = 0.01  # how far an object may be from the reference's place on its path [rad]
 SIMULATED_TOLERANCE = 1e-7  # of the integrator: a law makes errors fade
 UNSURE = 0.005  # distance from a corner within which angles do not tell its sides: 3 counts of 4096 a turn [rad]
 
@@ -114,7 +114,8 @@ def feedback(
     if shape:
         for k, table in enumerate(tables):
             terms[k] += [terms_of_other_shape(paths[k].dynamics, table) for paths in drawn if has_paths(paths[: k + 1])]
-            terms[k] += [_displaced(terms[k][0], table, by) for by in (-UNLIKE, UNLIKE)]
+    for k, table in enumerate(tables):
+        terms[k] += [_displaced(terms[k][0], table, by) for by in (-ASIDE, ASIDE)]
     either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
     limit = RESERVE * np.asarray(scene.hand.torque_limit)
     objects = [*zip(scenes, traces, strict=True), *zip(shapes, drawn, strict=True)]

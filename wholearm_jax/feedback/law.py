@@ -1,7 +1,7 @@
 r"""The law: torques from measured joint angles, sample after sample. NumPy alone.
 
-At each sample the measured angles are projected onto the curve of the phase's joint angles; a filter of second order
-makes of that the place `s` and the speed `v`; and the torque is
+At each sample the measured angles are projected onto the curve of the phase's joint angles; an observer of second
+order, which expects the reference's acceleration, makes of that the place `s` and the speed `v`; and the torque is
 
     tau = tau_ref(t) + g(s) a,    a = w^2 (s_ref - s) + 2 w (v_ref - v) + i,    di/dt = k_i w^2 (s_ref - s)
 
@@ -98,12 +98,17 @@ def _along(phase: PhaseLaw, s: float, table) -> Float[np.ndarray, "2"]:
 
 
 def _observe(controller: Controller, state: LawState, time: float, angles) -> LawState:
-    """Filter place and speed: a filter of second order with the rate `observer`, critically damped."""
-    h = time - state.time
+    """Observe place and speed: a filter of second order with the rate `observer`, critically damped.
+
+    It expects the speed to change as the reference's does, so that an object that follows needs no correction.
+    """
+    phase, h = controller.phases[state.phase], time - state.time
     r = np.exp(-controller.observer * h)
-    predicted = state.s + h * state.v
-    off = project_on_path(controller.phases[state.phase], angles, predicted) - predicted
-    s, v = predicted + (1 - r**2) * off, state.v + (1 - r) ** 2 * off / h if h > 0 else state.v
+    before, now = np.interp([state.time - state.began, time - state.began], phase.time, phase.v_ref)
+    faster = now - before
+    predicted = state.s + h * (state.v + faster / 2)
+    off = project_on_path(phase, angles, predicted) - predicted
+    s, v = predicted + (1 - r**2) * off, state.v + faster + ((1 - r) ** 2 * off / h if h > 0 else 0.0)
     still = state.still + h if state.pressed and abs(v) < controller.felt[0] else 0.0
     return state._replace(s=float(s), v=float(v), still=still)
 

@@ -3,7 +3,8 @@ r"""A closed-loop law in the time of one phase: its torque, and the rate of what
 In continuous time the law of `docs/feedback.md` is an ordinary differential equation for its memory `(s, v, i)`, the
 observed place and speed and the integral part, driven by the place `q` of the true joint angles:
 
-    ds/dt = v + 2 w_o (q - s),    dv/dt = w_o^2 (q - s),    di/dt = k w^2 (s_ref - s) where nothing is cut
+    ds/dt = v + 2 w_o (q - s),    dv/dt = dv_ref/dt + w_o^2 (q - s)
+    di/dt = k w^2 (s_ref - s) where nothing is cut
 
 Along a path `q` is a function of the path's own parameter; the torque is one of time and memory.
 """
@@ -97,7 +98,8 @@ def memory_rate(actuation: PhaseLoop, dynamics: PathDynamics, duration, segment,
     off = place_on_path(actuation, dynamics, segment, s) - memory[0]
     *_, is_cut, error = _act(actuation, row, phase_time, memory)
     integral = jnp.where(is_cut, 0.0, actuation.integral * error)
-    return duration * jnp.stack([memory[1] + 2 * actuation.observer * off, actuation.observer**2 * off, integral])
+    rate = jnp.stack([memory[1] + 2 * actuation.observer * off, actuation.observer**2 * off, integral])
+    return (duration * rate).at[1].add(take_row(actuation.slope, row)[1])
 
 
 def place_on_path(loop: PhaseLoop, dynamics: PathDynamics, segment, s) -> Float[Array, ""]:
