@@ -129,6 +129,19 @@ def test_an_unreachable_goal_names_the_nearest_pose(part):
     assert found.nearest.ends[-1][0] > float(part.start[0])
 
 
+@pytest.mark.parametrize(
+    ("by", "message"),
+    [
+        ({"x": -30.0}, "no plan: x = -29.98 m is far out of reach: lengths are in metres"),
+        ({"phi": -90.0}, "no plan: phi = -90.26 rad is 14.4 turns: angles are in radians"),
+    ],
+)
+def test_a_goal_in_another_unit_is_not_searched_for(part, by, message):
+    found = wa.plan(part, by=by)
+    assert found.reason.startswith(message)
+    assert found.nodes == 0
+
+
 def test_a_start_at_which_links_overlap_says_which(part):
     """Of fingers so long that they cross above the object, by shapely."""
     hand = eqx.tree_at(lambda h: h.length, part.hand, jnp.full(2, 0.17))

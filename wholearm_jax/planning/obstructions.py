@@ -4,12 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from wholearm_jax.model import ANGLE_COORDINATES
+from wholearm_jax.model import ANGLE_COORDINATES, Hand
 from wholearm_jax.planning.goal import Goal
 from wholearm_jax.planning.moves import Move
 from wholearm_jax.tracing import PathEnd
 
 MOST = 3  # moves that are named
+FAR = 5.0  # distance from the palm's middle, over the hand's reach, at which a goal cannot be meant
+FAR_ANGLE = 4 * np.pi  # [rad]
 
 
 def explain_failure(goal: Goal, z: np.ndarray, moves: Sequence[Move], floor: float, *, out_of_time: bool) -> str:
@@ -30,6 +32,20 @@ def explain_failure(goal: Goal, z: np.ndarray, moves: Sequence[Move], floor: flo
     limit = "the search's limit was reached" if out_of_time else "all moves were tried"
     lines = [_explain_move(move, floor) for move in moves[:MOST]] or ["nothing that touches leads nearer"]
     return f"no plan: {limit}; nearest: {', '.join(missing) or 'at the goal'}; there {'; '.join(lines)}"
+
+
+def explain_far_goal(goal: Goal, hand: Hand) -> str:
+    """Say that a goal is so far off that its unit must be another one; nothing where it may be meant."""
+    far = FAR * float((abs(hand.joint).max(1) + hand.length).max())
+    for name, value in goal.values.items():
+        if name in ANGLE_COORDINATES and abs(value) > FAR_ANGLE:
+            turns = abs(value) / (2 * np.pi)
+            return (
+                f"{name} = {value:.4g} rad is {turns:.3g} turns: angles are in radians, on the command line also 'deg'"
+            )
+        if name not in ANGLE_COORDINATES and abs(value) > far:
+            return f"{name} = {value:.4g} m is far out of reach: lengths are in metres, on the command line also 'mm'"
+    return ""
 
 
 def _explain_move(move: Move, floor: float) -> str:

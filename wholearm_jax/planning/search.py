@@ -25,7 +25,7 @@ from wholearm_jax.model import ANGLE_COORDINATES, AWAY_NAMES, COORDINATES, Scene
 from wholearm_jax.phases import describe_overlaps, possible_hand_overs, trace
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import Move, moves_from
-from wholearm_jax.planning.obstructions import explain_failure
+from wholearm_jax.planning.obstructions import explain_failure, explain_far_goal
 from wholearm_jax.planning.plans import (
     Edge,
     Plan,
@@ -132,8 +132,9 @@ def plan(
         regrasp_cost=regrasp_cost,
     )
     overlaps = describe_overlaps(scene, as_device_array(start))
-    if overlaps:
-        return PlanningResult(start, search.goal, (), None, f"no plan: at the start {'; '.join(overlaps)}", 0, 0, ())
+    vain = f"at the start {'; '.join(overlaps)}" if overlaps else explain_far_goal(search.goal, scene.hand)
+    if vain:
+        return PlanningResult(start, search.goal, (), None, f"no plan: {vain}", 0, 0, ())
     _push(search, start, (), touching)
     out_of_time = _run(search, time_limit, max_nodes, callback)
     nearest, reason = None, ""
