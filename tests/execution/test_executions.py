@@ -502,10 +502,10 @@ TORQUE = ("--torque", DATA / "heptagon_torque.csv")
 
 
 def test_command(wholearm, tmp_path):
-    code, out, err = wholearm(
-        "execute", layered_file("heptagon"), *TORQUE, "--timestep", 5e-4, "--perturb", 2, "--out", tmp_path
-    )
+    options = ("--timestep", 5e-4, "--perturb", 2, "--push", "x=0.01@9", "--out", tmp_path)
+    code, out, err = wholearm("execute", layered_file("heptagon"), *TORQUE, *options)
     assert code == 0
+    assert "note: --push x=0.01@9: the execution ends at 2 s, before it" in err
     assert "palm:v5 opened: 1.0050 s predicted" in out
     assert "of 2 perturbed executions succeed" in out
     assert out.splitlines()[-1].startswith("executed: ok, ")

@@ -13,6 +13,7 @@ from wholearm_jax.cli.arguments import (
     SceneName,
     load_scene,
     make_output_folder,
+    note,
     refuse_unwritable,
 )
 from wholearm_jax.cli.interruption import quiet_workers
@@ -89,6 +90,10 @@ def execute(
     settings = {"timestep": timestep, "tolerance": Tolerance(position, angle), "controller": law, "hardware": hardware}
     settings |= {"pushes": pushes}
     execution = rollout(prediction, seed=seed, **settings)
+    end = float(execution.course.time[-1])
+    for text, one in zip(push or (), pushes, strict=True):
+        if one.time >= end:
+            note(f"--push {text}: the execution ends at {end:.4g} s, before it")
     trials = _run_trials(prediction, perturb, amounts, seed=seed, **settings) if perturb else None
     more: dict[str, Any] = {"torque": str(torque)}
     if law is not None:
