@@ -111,6 +111,12 @@ def test_the_least_force_under_a_law_is_that_of_the_model(controller, scene):
     assert model.status[0] == 0
     assert run.least_force == pytest.approx(float(model.margin[0]), abs=0.05 * mean)
     assert trials.message.endswith("all contacts kept on the way: 1")
+    # The reference stands phase by phase from when the law began each, and waits for the next one.
+    assert course.begins[1] > controller.phases[0].duration
+    expected = course.expected
+    assert expected.time[-1] == pytest.approx(course.course.time[-1])
+    late = np.stack([np.interp(expected.time, course.course.time, course.course.z[:, k]) for k in (0, 1)], axis=1)
+    assert np.hypot(*(late - expected.z[:, :2]).T).max() < 5e-4
 
 
 def test_the_margin_is_that_of_the_set_under_the_law(controller, scene):

@@ -63,6 +63,7 @@ class ControlledMotor:
         self._state, self._torque = None, controller.phases[0].torque[0]
         self._pending: deque[tuple[int, np.ndarray]] = deque()
         self._end: int | None = None
+        self.begins: list[float] = []  # when each phase that the controller has come to began [s]
 
     @property
     def phase(self) -> int:
@@ -86,6 +87,8 @@ class ControlledMotor:
         if self._state is None:
             self._state = begin(self._controller, measured, time)
         self._state, torque = law_step(self._controller, self._state, time, measured)
+        if self._state.phase == len(self.begins):
+            self.begins.append(self._state.began)
         noisy = torque * (1 + self._hardware.torque_noise * self._random.standard_normal(2))
         limit = self._controller.torque_limit
         self._pending.append((k + self._late, np.clip(noisy, -limit, limit)))

@@ -98,15 +98,17 @@ class Execution:
     """An executed plan beside its prediction.
 
     `course` is what happened, at every step; `expected` what was predicted, or a law's reference (NaN: friction holds
-    the object at rest, or the prediction ended). Their contacts are `names`, all pairs that may touch; `planned` are
-    those of the phases, which do not say here whether they should roll. `link_contacts` are what links met, and when
-    first [s]. `creep` is how far contacts slipped against Coulomb's law, at most [m]: an execution that crept farther
-    than its tolerance diverged.
+    the object at rest, the prediction ended, or the law waits for the next phase); `begins` is when phases begin [s].
+    A law changes phases by what it measures: its reference stands here phase by phase from when it did. Their contacts
+    are `names`, all pairs that may touch; `planned` are those of the phases, which do not say here whether they should
+    roll. `link_contacts` are what links met, and when first [s]. `creep` is how far contacts slipped against Coulomb's
+    law, at most [m]: an execution that crept farther than its tolerance diverged.
     """
 
     prediction: Result
     course: ExecutedMotion
     expected: ExecutedMotion
+    begins: tuple[float, ...]
     names: tuple[str, ...]
     target: Float[np.ndarray, "5"]
     tolerance: Tolerance
@@ -176,19 +178,25 @@ def execute(
     require_paths(prediction)
     times, step = clock(scene, timestep)
     torques: Float[np.ndarray, "steps 2"] | Motor = motor_torques(prediction.torque, times, step)
+    begins = [float(phase.start) for phase in prediction.phases]
     if controller is not None:
         step = closed_loop_step(controller, hardware, scene, timestep)
-        torques = ControlledMotor(controller, hardware, step, seed)
+        torques = motor = ControlledMotor(controller, hardware, step, seed)
+        begins = motor.begins  # filled on the way
     bodies = build_mujoco_model(scene, step, softness)
     course, creep, met = run_schedule(bodies, scene, start_of(prediction), torques, step, pushes)
     courses = trajectory(prediction, SAMPLES) if controller is None else planned_motion(controller, prediction)
-    expected, target = _expected(prediction, bodies.names, courses), target_of(prediction)
+    phases, target = _expected_phases(prediction, bodies.names, courses), target_of(prediction)
+    if controller is not None:
+        phases = _as_begun(phases, begins, float(course.time[-1]))
+    expected = ExecutedMotion(*(np.concatenate(field) for field in zip(*phases, strict=True)))
     unexpected = unexpected_meetings(prediction, met)
     ending, lost = assess_execution(scene, course.z[-1], target, tolerance, creep, unexpected)
     return Execution(
         prediction=prediction,
         course=course,
         expected=expected,
+        begins=tuple(begins),
         names=bodies.names,
         target=target,
         tolerance=tolerance,
@@ -353,8 +361,10 @@ def assess_execution(
     return (ExecutionOutcome.CONTACT_LOST if lost else ExecutionOutcome.OK if near else ExecutionOutcome.ASTRAY), lost
 
 
-def _expected(prediction: Result, names: tuple[str, ...], courses: tuple[Trajectory, ...]) -> ExecutedMotion:
-    """What the prediction, or a law's reference, has phase by phase, as one course over all `names`."""
+def _expected_phases(
+    prediction: Result, names: tuple[str, ...], courses: tuple[Trajectory, ...]
+) -> list[ExecutedMotion]:
+    """Return what the prediction, or a law's reference, has phase by phase, over all `names`."""
     phases = []
     for phase, at in zip(prediction.phases, courses, strict=False):
         cn, ct = np.zeros((2, len(at.time), len(names)))
@@ -362,7 +372,22 @@ def _expected(prediction: Result, names: tuple[str, ...], courses: tuple[Traject
         cn[:, columns], ct[:, columns] = at.cn[:, : len(columns)], at.ct[:, : len(columns)]
         time, z, z_dot = (np.asarray(a) for a in (at.time, at.z, at.z_dot))
         phases.append(ExecutedMotion(time, z, z_dot, cn, ct, touching_contacts_at(prediction.scene, names, z)))
-    return ExecutedMotion(*(np.concatenate(field) for field in zip(*phases, strict=True)))
+    return phases
+
+
+def _as_begun(phases: list[ExecutedMotion], begins: Sequence[float], end: float) -> list[ExecutedMotion]:
+    """Move phases to when a law began them: each waits for the next one, or is cut short by it; the last until `end`.
+
+    While it waits its forces are not known: the law presses.
+    """
+    moved = []
+    for phase, begin, until in zip(phases, begins, [*begins[1:], end], strict=False):
+        time = phase.time - phase.time[0] + begin
+        kept = ExecutedMotion(*(field[time <= until] for field in (time, *phase[1:])))
+        last = [field[-1:] for field in kept]
+        unknown = np.full_like(last[3], np.nan)
+        moved += [kept, ExecutedMotion(np.array([until]), last[1], 0 * last[2], unknown, unknown, last[5])]
+    return moved
 
 
 def _events(names: tuple[str, ...], expected: ExecutedMotion, course: ExecutedMotion) -> tuple[Event, ...]:

@@ -97,7 +97,7 @@ def plot_execution_forces(execution: Execution, ax: Axes | None = None) -> Axes:
     ax.set_ylim(-0.03 * high, 1.35 * high)
     ax.plot([], [], color=PALE, lw=3.5, alpha=0.6, label="predicted")
     ax.set_ylabel("contact force $c_n$ [N]")
-    format_time_axis(ax, execution.prediction)
+    _format_time(ax, execution)
     return _legend_beside(ax)
 
 
@@ -111,7 +111,7 @@ def plot_deviation(execution: Execution, ax: Axes | None = None) -> Axes:
     rim = 1e3 * np.hypot(*corners.T).max() * np.abs(off[:, 2])
     ax.plot(expected.time, 1e3 * np.hypot(off[:, 0], off[:, 1]), color=COLOURS[0], label="centre of mass")
     ax.plot(expected.time, rim, color=COLOURS[1], ls="--", label="angle, at its rim")
-    format_time_axis(ax, execution.prediction, named=False)
+    _format_time(ax, execution, named=False)
     ax.set_ylim(bottom=0)
     ax.set_ylabel("deviation [mm]")
     return _legend_beside(ax)
@@ -127,10 +127,16 @@ def plot_touching(execution: Execution, ax: Axes | None = None) -> Axes:
         for course, height, alpha in ((execution.expected, 0.8, 0.35), (execution.course, 0.3, 1.0)):
             for begin, end in _spans(course.time, course.touch[:, column]):
                 ax.barh(place, end - begin, left=begin, height=height, color=colour, alpha=alpha, lw=0)
-    format_time_axis(ax, execution.prediction, named=False, zero=False)
+    _format_time(ax, execution, named=False, zero=False)
     ax.set_yticks(range(len(shown)), shown)
     ax.set_ylim(len(shown) - 0.5, -0.5)
     return ax
+
+
+def _format_time(ax: Axes, execution: Execution, **options: bool) -> None:
+    """Format the axis of time of an execution, whose phases a law may have begun later than planned."""
+    end = max(float(execution.course.time[-1]), float(execution.expected.time[-1]))
+    format_time_axis(ax, execution.prediction, begins=execution.begins, end=end, **options)
 
 
 def _touches(execution: Execution, name: str) -> bool:

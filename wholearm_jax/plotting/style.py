@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -64,16 +64,29 @@ def dash_style(number: int):
     return (0, DASHES[number]) if DASHES[number] else "-"
 
 
-def format_time_axis(ax: Axes, result: Result, *, named: bool = True, zero: bool = True) -> None:
-    """Format an axis of time: its label, the phases, and its frame."""
-    for phase, label in zip(result.phases, _phase_labels(ax, result), strict=True):
-        ax.axvline(phase.start, color=PALE, lw=0.6, ls=":")
-        middle, transform = phase.start + phase.duration / 2, ax.get_xaxis_transform()
+def format_time_axis(
+    ax: Axes,
+    result: Result,
+    *,
+    named: bool = True,
+    zero: bool = True,
+    begins: Sequence[float] | None = None,
+    end: float | None = None,
+) -> None:
+    """Format an axis of time: its label, the phases, and its frame.
+
+    An execution may begin phases at other times than planned, at `begins`, or only some, and `end` later [s].
+    """
+    begins = [phase.start for phase in result.phases] if begins is None else begins
+    end = result.phases[-1].start + result.phases[-1].duration if end is None else end
+    for begin, until, label in zip(begins, [*begins[1:], end], _phase_labels(ax, result), strict=False):
+        ax.axvline(begin, color=PALE, lw=0.6, ls=":")
+        middle, transform = (begin + until) / 2, ax.get_xaxis_transform()
         if named:
             ax.text(middle, 1.01, label, transform=transform, ha="center", va="bottom", style="italic")
     if zero:
         ax.axhline(0, color=INK, lw=0.6)
-    ax.set_xlim(0, result.phases[-1].start + result.phases[-1].duration)
+    ax.set_xlim(0, end)
     ax.set_xlabel("time $t$ [s]")
     ax.spines[["top", "right"]].set_visible(False)
 
