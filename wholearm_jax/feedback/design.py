@@ -110,12 +110,11 @@ def feedback(
     shapes = draw_shapes(scenes, shape)
     drawn = [trace(other) for other in shapes]
     approaches = _approaches(scene, traces[0], tables, drawn)
-    terms = [[path_terms(paths[k].dynamics, table) for paths in traces] for k, table in enumerate(tables)]
-    if shape:
-        for k, table in enumerate(tables):
-            terms[k] += [terms_of_other_shape(paths[k].dynamics, table) for paths in drawn if has_paths(paths[: k + 1])]
-    for k, table in enumerate(tables):
-        terms[k] += [_displaced(terms[k][0], table, by) for by in (-ASIDE, ASIDE)]
+    with_paths = [[paths for paths in drawn if shape and has_paths(paths[: k + 1])] for k in range(len(tables))]
+    terms = [
+        _terms_of_set(table, [paths[k] for paths in traces], [paths[k] for paths in others])
+        for k, (table, others) in enumerate(zip(tables, with_paths, strict=True))
+    ]
     either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
     limit = RESERVE * np.asarray(scene.hand.torque_limit)
     objects = [*zip(scenes, traces, strict=True), *zip(shapes, drawn, strict=True)]
@@ -148,9 +147,17 @@ def _with_simulated_margins(controller: Controller, objects: list[tuple[Scene, t
     """
     tables, options = law_tables(controller), IntegratorOptions(tolerance=SIMULATED_TOLERANCE)
     runs = [simulate_closed_loop(scene, tables, paths, options) for scene, paths in objects if has_paths(paths)]
-    least = [min(float(run[k].margin_result.margin) for run in runs) for k in range(len(controller.phases))]
+    margins = np.array([[float(phase.margin_result.margin) for phase in run] for run in runs])
+    least = np.where(np.isnan(margins).any(0), -np.inf, margins.min(0)).tolist()
     phases = zip(controller.phases, least, strict=True)
     return replace(controller, phases=tuple(replace(law, margin=min(law.margin, margin)) for law, margin in phases))
+
+
+def _terms_of_set(table: PathTable, alike: list[TracedPhase], other_shapes: list[TracedPhase]) -> list[PathTerms]:
+    """Return the terms of all objects that have to be held on a path: the nominal one first, also a little aside."""
+    terms = [path_terms(path.dynamics, table) for path in alike]
+    terms += [terms_of_other_shape(path.dynamics, table) for path in other_shapes]
+    return terms + [_displaced(terms[0], table, by) for by in (-ASIDE, ASIDE)]
 
 
 def _displaced(terms: PathTerms, table: PathTable, by: float) -> PathTerms:
