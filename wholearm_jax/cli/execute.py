@@ -90,10 +90,7 @@ def execute(
     settings = {"timestep": timestep, "tolerance": Tolerance(position, angle), "controller": law, "hardware": hardware}
     settings |= {"pushes": pushes}
     execution = rollout(prediction, seed=seed, **settings)
-    end = float(execution.course.time[-1])
-    for text, one in zip(push or (), pushes, strict=True):
-        if one.time >= end:
-            note(f"--push {text}: the execution ends at {end:.4g} s, before it")
+    _note_late_pushes(push or [], pushes, float(execution.course.time[-1]))
     trials = _run_trials(prediction, perturb, amounts, seed=seed, **settings) if perturb else None
     more: dict[str, Any] = {"torque": str(torque)}
     if law is not None:
@@ -110,6 +107,13 @@ def execute(
     else:
         _print_execution(execution, trials, folder)
     sys.exit(0 if ok else 1)
+
+
+def _note_late_pushes(texts: list[str], pushes, end: float) -> None:
+    """Say which pushes come after an execution's end [s]."""
+    for text, one in zip(texts, pushes, strict=True):
+        if one.time >= end:
+            note(f"--push {text}: the execution ends at {end:.4g} s, before it")
 
 
 def _predict(name: str, scene, torque: Path | None, controller: Path | None):

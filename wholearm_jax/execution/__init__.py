@@ -2,6 +2,7 @@
 
 from wholearm_jax.execution.closed_loop import IDEAL, Hardware
 from wholearm_jax.execution.disturbances import DisturbanceMap, friction_map, push_map, start_map
+from wholearm_jax.execution.executed_motion import touching_contacts_at
 from wholearm_jax.execution.executions import (
     Execution,
     ExecutionOutcome,
@@ -11,7 +12,6 @@ from wholearm_jax.execution.executions import (
     motor_torques,
     require_paths,
     start_of,
-    touching_contacts_at,
 )
 from wholearm_jax.execution.mujoco_model import CONVEX, ContactCompliance, build_mujoco_model
 from wholearm_jax.execution.pushes import Push, push

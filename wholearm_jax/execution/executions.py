@@ -3,9 +3,8 @@ of it against the prediction.
 
 The object is placed at the projected start of the plan's first path, at rest, every gap 0; nothing settles before the
 torque begins. Each step holds the torque of its middle. The plan succeeded if at its end the object stands where the
-prediction says and every contact of the last phase is closed, both to within a tolerance. When a contact is made or
-opened is read off the gaps, by one rule for prediction and execution: it touches while its gap is below `TOUCH` and it
-lies on its feature.
+prediction says and every contact of the last phase is closed, both to within a tolerance (`executed_motion` says which
+contacts touch).
 """
 
 # MuJoCo's names come from a compiled module, which type checkers cannot see into.
@@ -16,11 +15,9 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from wholearm_jax.core import Status, require_positive
 from wholearm_jax.execution.acting_pairs import choose_pairs
@@ -30,26 +27,27 @@ from wholearm_jax.execution.closed_loop import (
     closed_loop_step,
 )
 from wholearm_jax.execution.coulomb_friction import advance, has_given_up
+from wholearm_jax.execution.executed_motion import (
+    Event,
+    ExecutedMotion,
+    as_begun,
+    contact_events,
+    expected_phases,
+    touching_contacts_at,
+)
 from wholearm_jax.execution.link_meetings import record_meetings, unexpected_meetings
 from wholearm_jax.execution.mujoco_model import ContactCompliance, MujocoModel, build_mujoco_model
 from wholearm_jax.execution.pushes import Push, push_force
 from wholearm_jax.feedback import Controller, planned_motion
 from wholearm_jax.model import (
     Arrival,
-    ContactFormation,
-    Hand,
-    RigidBody,
     Scene,
     TorqueSchedule,
-    contact_formation,
-    contact_kinematics,
-    contact_set,
     feature_pair,
     rigid_body,
 )
-from wholearm_jax.phases import Result, Trajectory, target_configuration, trajectory
+from wholearm_jax.phases import Result, target_configuration, trajectory
 
-TOUCH = 1e-3  # gap below which a contact counts as touching [object radii]
 SAMPLES = 2001  # of the prediction, a phase
 
 Motor = Callable[[int, Float[np.ndarray, "2"]], Float[np.ndarray, "2"] | None]
@@ -71,26 +69,6 @@ class ExecutionOutcome(enum.Enum):
     CONTACT_LOST = "contact_lost"  # a contact of the last phase is open
     ASTRAY = "astray"  # all are closed, but the object does not stand where it should
     DIVERGED = "diverged"  # MuJoCo gave up, or contacts crept farther than the tolerance: too long a time step
-
-
-class Event(NamedTuple):
-    """A contact made or opened: when [s] in the prediction, and when in the execution; None where it was not."""
-
-    contact: str
-    made: bool
-    predicted: float | None
-    executed: float | None
-
-
-class ExecutedMotion(NamedTuple):
-    """States and contacts over time, SI units. `cn`, `ct` act on the object, 0 without contact; `touch` by `TOUCH`."""
-
-    time: Float[np.ndarray, "samples"]
-    z: Float[np.ndarray, "samples 5"]
-    z_dot: Float[np.ndarray, "samples 5"]
-    cn: Float[np.ndarray, "samples contacts"]
-    ct: Float[np.ndarray, "samples contacts"]
-    touch: Bool[np.ndarray, "samples contacts"]
 
 
 @dataclass(frozen=True)
@@ -186,9 +164,9 @@ def execute(
     bodies = build_mujoco_model(scene, step, softness)
     course, creep, met = run_schedule(bodies, scene, start_of(prediction), torques, step, pushes)
     courses = trajectory(prediction, SAMPLES) if controller is None else planned_motion(controller, prediction)
-    phases, target = _expected_phases(prediction, bodies.names, courses), target_of(prediction)
+    phases, target = expected_phases(prediction, bodies.names, courses), target_of(prediction)
     if controller is not None:
-        phases = _as_begun(phases, begins, float(course.time[-1]))
+        phases = as_begun(phases, begins, float(course.time[-1]))
     expected = ExecutedMotion(*(np.concatenate(field) for field in zip(*phases, strict=True)))
     unexpected = unexpected_meetings(prediction, met)
     ending, lost = assess_execution(scene, course.z[-1], target, tolerance, creep, unexpected)
@@ -203,7 +181,7 @@ def execute(
         ending=ending,
         creep=creep,
         open_at_end=lost,
-        events=_events(bodies.names, expected, course),
+        events=contact_events(bodies.names, expected, course),
         link_contacts=met,
         timestep=step,
         model_xml=bodies.xml,
@@ -330,21 +308,6 @@ def _read_forces(bodies: MujocoModel, data: mujoco.MjData, into) -> None:
     np.add.at(into[:, 1], row[acting], force[:, 0] * normal[:, 1] - force[:, 1] * normal[:, 0])
 
 
-def touching_contacts_at(scene: Scene, names: tuple[str, ...], z, slack: float | None = None) -> np.ndarray:
-    """Which contacts are closed to within `force_slack` [m] (default: `TOUCH`) at configurations `z (samples, 5)`."""
-    solid = rigid_body(scene.object)
-    slack = TOUCH * float(np.hypot(*np.asarray(solid.vertices).T).max()) if slack is None else slack
-    return np.asarray(_touching(solid, scene.hand, contact_formation(names), z, slack))
-
-
-@jax.jit
-def _touching(solid: RigidBody, hand: Hand, pairs: ContactFormation, z, slack):
-    candidates = contact_set(solid, hand, pairs)
-    at = jax.vmap(contact_kinematics, (None, 0))(candidates, z)
-    on_feature = (at.along > candidates.lower - slack) & (at.along < candidates.upper + slack)
-    return (jnp.abs(at.gap) < slack) & on_feature  # far behind an edge's line the gap is negative, and nothing touches
-
-
 def assess_execution(
     scene: Scene, z, target, tolerance: Tolerance, creep: float = 0.0, links_met: Collection[str] = ()
 ) -> tuple[ExecutionOutcome, tuple[str, ...]]:
@@ -359,54 +322,3 @@ def assess_execution(
     if not creep <= tolerance.position:
         return ExecutionOutcome.DIVERGED, lost
     return (ExecutionOutcome.CONTACT_LOST if lost else ExecutionOutcome.OK if near else ExecutionOutcome.ASTRAY), lost
-
-
-def _expected_phases(
-    prediction: Result, names: tuple[str, ...], courses: tuple[Trajectory, ...]
-) -> list[ExecutedMotion]:
-    """Return what the prediction, or a law's reference, has phase by phase, over all `names`."""
-    phases = []
-    for phase, at in zip(prediction.phases, courses, strict=False):
-        cn, ct = np.zeros((2, len(at.time), len(names)))
-        columns = [names.index(feature_pair(name)) for name in phase.contacts]
-        cn[:, columns], ct[:, columns] = at.cn[:, : len(columns)], at.ct[:, : len(columns)]
-        time, z, z_dot = (np.asarray(a) for a in (at.time, at.z, at.z_dot))
-        phases.append(ExecutedMotion(time, z, z_dot, cn, ct, touching_contacts_at(prediction.scene, names, z)))
-    return phases
-
-
-def _as_begun(phases: list[ExecutedMotion], begins: Sequence[float], end: float) -> list[ExecutedMotion]:
-    """Move phases to when a law began them: each waits for the next one, or is cut short by it; the last until `end`.
-
-    While it waits its forces are not known: the law presses.
-    """
-    moved = []
-    for phase, begin, until in zip(phases, begins, [*begins[1:], end], strict=False):
-        time = phase.time - phase.time[0] + begin
-        kept = ExecutedMotion(*(field[time <= until] for field in (time, *phase[1:])))
-        last = [field[-1:] for field in kept]
-        unknown = np.full_like(last[3], np.nan)
-        moved += [kept, ExecutedMotion(np.array([until]), last[1], 0 * last[2], unknown, unknown, last[5])]
-    return moved
-
-
-def _events(names: tuple[str, ...], expected: ExecutedMotion, course: ExecutedMotion) -> tuple[Event, ...]:
-    """Changes of contact in the prediction, each beside the nearest like one in the execution; then what is left."""
-    found, events = _changes(course), []
-    for (contact, made), whens in _changes(expected).items():
-        for when in whens:
-            others = found.get((contact, made), [])
-            nearest = min(others, key=lambda t, when=when: abs(t - when), default=None)
-            if nearest is not None:
-                others.remove(nearest)
-            events.append(Event(names[contact], made, when, nearest))
-    events += [Event(names[c], made, None, when) for (c, made), whens in found.items() for when in whens]
-    return tuple(sorted(events, key=lambda e: e.executed if e.predicted is None else e.predicted))
-
-
-def _changes(course: ExecutedMotion) -> dict[tuple[int, bool], list[float]]:
-    """(contact, made) -> the times at which a contact is made (True) or opened (False)."""
-    found: dict[tuple[int, bool], list[float]] = {}
-    for row, contact in np.argwhere(course.touch[1:] != course.touch[:-1]):
-        found.setdefault((int(contact), bool(course.touch[row + 1, contact])), []).append(float(course.time[row + 1]))
-    return found
