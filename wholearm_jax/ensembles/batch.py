@@ -24,6 +24,7 @@ from wholearm_jax.feedback import Controller, law_tables, require_same_plan
 from wholearm_jax.model import LawTables, Scene, TorqueSchedule, pad_schedule
 from wholearm_jax.phases import (
     CLOSED_LOOP_STEPS,
+    CLOSED_LOOP_TOLERANCE,
     closed_loop_options,
     closed_loop_result,
     has_torque_jumps,
@@ -35,7 +36,6 @@ from wholearm_jax.phases import (
 
 CHUNK = 4096  # scenes whose results are kept together
 BATCH_ARRIVAL = 0.01  # fraction of the path: scenes that vary cannot end exactly where the nominal scene must
-LOOP_TOLERANCE = 1e-7  # least tolerance of the integrator in closed loop: a law makes errors fade
 LOOP_STEPS = 320  # of a phase in closed loop, in the first pass
 MIN_COARSE_TOLERANCE = 1e-9  # [N], smaller tolerances begin at the full resolution
 
@@ -170,7 +170,7 @@ def _check_alone(
 def _fidelity_for(nominal: Scene, torque: TorqueSchedule | LawTables, fidelity: Fidelity) -> Fidelity:
     """Return the fidelity with the options that a schedule, or a law, requires."""
     if isinstance(torque, LawTables):
-        tolerance = max(fidelity.options.tolerance, LOOP_TOLERANCE)
+        tolerance = max(fidelity.options.tolerance, CLOSED_LOOP_TOLERANCE)
         steps = LOOP_STEPS if fidelity is COARSE_PASS else CLOSED_LOOP_STEPS
         options = closed_loop_options(replace(fidelity.options, tolerance=tolerance), steps)
     else:

@@ -198,11 +198,8 @@ def _add_object(spec, solid, size):
     corners = solid.vertices[: solid.count]
     for k, corner in enumerate(corners):
         _add_geom(body_, f"v{k}", "SPHERE", [POINT_RADIUS * size, 0, 0], [*corner, 0])
-    thick, dot, beyond = (
-        HALF_SPACE_DEPTH * size,
-        POINT_RADIUS * size,
-        2 * EDGE_DEPTH * size,
-    )  # ends are farther than deep
+    thick, dot = HALF_SPACE_DEPTH * size, POINT_RADIUS * size
+    beyond = 2 * EDGE_DEPTH * size  # slabs reach beyond their edges' ends by more than bodies sink in
     for k, (start, end) in enumerate(zip(corners, np.roll(corners, -1, 0), strict=True)):
         length = float(np.hypot(*(end - start)))
         _add_slab(body_, f"e{k}", -beyond, length + beyond, dot, 1.0, thick, start, (end - start) / length)

@@ -24,6 +24,7 @@ from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop, stays
 from wholearm_jax.feedback.torque_choice import TorqueChoice, choose_torques
 from wholearm_jax.model import Arrival, Scene, TorqueSchedule
 from wholearm_jax.phases import (
+    CLOSED_LOOP_TOLERANCE,
     TracedPhase,
     ends_at_stop,
     group_phases,
@@ -44,7 +45,6 @@ SLOW_SHARE = 0.25  # of a phase's duration, at most, that the reference takes to
 FELT = (0.05, 0.03)  # speed [rad/s] below which an object stands, and for how long [s]
 LONGEST_DELAY = 1.0  # longest time beyond a phase's duration [s]
 ASIDE = 0.01  # how far an object may be from the reference's place on its path [rad]
-SIMULATED_TOLERANCE = 1e-7  # of the integrator: a law makes errors fade
 UNSURE = 0.005  # distance from a corner within which angles do not tell its sides: 3 counts of 4096 a turn [rad]
 
 
@@ -110,10 +110,10 @@ def feedback(
     shapes = draw_shapes(scenes, shape)
     drawn = [trace(other) for other in shapes]
     approaches = _approaches(scene, traces[0], tables, drawn)
-    with_paths = [[paths for paths in drawn if shape and has_paths(paths[: k + 1])] for k in range(len(tables))]
+    held = drawn if shape else []  # the others only say where stops may be
     terms = [
-        _terms_of_set(table, [paths[k] for paths in traces], [paths[k] for paths in others])
-        for k, (table, others) in enumerate(zip(tables, with_paths, strict=True))
+        _terms_of_set(table, [paths[k] for paths in traces], [paths[k] for paths in held if has_paths(paths[: k + 1])])
+        for k, table in enumerate(tables)
     ]
     either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
     limit = RESERVE * np.asarray(scene.hand.torque_limit)
@@ -136,7 +136,7 @@ def feedback(
         patience=LONGEST_DELAY,
         torque_limit=np.asarray(scene.hand.torque_limit),
     )
-    return _with_simulated_margins(controller, objects if shape else objects[: len(scenes)])
+    return _with_simulated_margins(controller, objects[: len(traces) + len(held)])
 
 
 def _with_simulated_margins(controller: Controller, objects: list[tuple[Scene, tuple[TracedPhase, ...]]]) -> Controller:
@@ -145,7 +145,7 @@ def _with_simulated_margins(controller: Controller, objects: list[tuple[Scene, t
     The choice of torques lets every object move as the reference does; in closed loop one of other friction is late,
     or early, until the loop has made up for it.
     """
-    tables, options = law_tables(controller), IntegratorOptions(tolerance=SIMULATED_TOLERANCE)
+    tables, options = law_tables(controller), IntegratorOptions(tolerance=CLOSED_LOOP_TOLERANCE)
     runs = [simulate_closed_loop(scene, tables, paths, options) for scene, paths in objects if has_paths(paths)]
     margins = np.array([[float(phase.margin_result.margin) for phase in run] for run in runs])
     least = np.where(np.isnan(margins).any(0), -np.inf, margins.min(0)).tolist()

@@ -101,10 +101,10 @@ def _worst(acceleration, slack, speeds, a: float, limit, torque, g):
 
 
 def _smoothest(score, torque, turn):
-    """Choose `x` and `turn` at each place for the largest sum of scores (places, x, turns) less the price of change."""
+    """Choose `x` and `turn` at each place for the largest sum of scores (places, x, turns) less the cost of change."""
     best, came_from = score[0], []
     for k in range(1, len(score)):
-        # The best turn before for each turn, and then the best `x` before for each: the prices are apart.
+        # The best turn before for each turn, and then the best `x` before for each: the costs are apart.
         change = ((turn[k - 1][:, None] - turn[k]) / TURN_STEP) ** 2
         options = best[:, :, None] - change
         turn_before, reached = options.argmax(1), options.max(1)

@@ -3,6 +3,7 @@
 from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, IMPULSE_ROUNDING, assess_phase
 from wholearm_jax.phases.closed_loop import (
     CLOSED_LOOP_STEPS,
+    CLOSED_LOOP_TOLERANCE,
     closed_loop_margin,
     closed_loop_options,
     initial_loop_carry,

@@ -35,6 +35,7 @@ from wholearm_jax.tracing import Resolution
 
 CLOSED_LOOP_ARRIVAL = 0.01  # distance from the path's end within which a phase must end, in path lengths
 LANDING = 2.0  # speed at which an object may meet the stop that ends a phase, over that of the approach
+CLOSED_LOOP_TOLERANCE = 1e-7  # of the integrator where objects are many: a law makes errors fade
 CLOSED_LOOP_STEPS = 1024  # of a phase: the rows of its reference, twice, and the kinks of its gains
 CLOSED_LOOP_STAGES = 12  # smooth stages of a phase: a law may stop the object and start it again
 
