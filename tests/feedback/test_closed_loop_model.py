@@ -28,6 +28,7 @@ from wholearm_jax.phases import (
     simulate_closed_loop,
 )
 from wholearm_jax.simulation import IntegratorOptions, phase_loop
+from wholearm_jax.simulation.closed_loop import memory_rate
 
 FRICTION = np.array([1.1, 0.95, 1.15])  # of each link, over the scene's
 
@@ -82,6 +83,28 @@ def test_the_motion_is_that_of_all_five_coordinates(thin, rougher, traced):
     _, force = states[np.searchsorted(asked, lowest)]
     assert float(first.margin_result.margin) == pytest.approx(force, abs=1e-6)
     assert float(first.margin_result.margin) <= min(least for _, least in states) + 1e-6
+
+
+def test_the_integral_part_goes_on_where_the_feedback_is_cut(thin, traced):
+    """Its rate has no jump at the cut, where a motion could stay, and nothing winds up beyond it."""
+    law = law_tables(thin)
+    loop = phase_loop(law, jax.tree.map(lambda leaf: leaf[0], law.phases), traced[0].dynamics)
+    middle = jnp.asarray(0.25)  # before the end presses
+    row, k = jnp.searchsorted(loop.phase_time, middle, side="right") - 1, float(loop.integral)
+    s_ref, v_ref = np.asarray(loop.reference[row] + loop.slope[row] * (middle - loop.phase_time[row]))[:2]
+    s = s_ref - 1e-3
+
+    def rate(i):
+        memory = jnp.array([s, v_ref, i])
+        return float(memory_rate(loop, traced[0].dynamics, 1.0, jnp.asarray(0), row, middle, jnp.asarray(s), memory)[2])
+
+    gain = np.array([np.interp(s, loop.s, loop.gain[:, joint]) for joint in range(2)])
+    most, pull = float(loop.push) / np.abs(gain).max(), float(loop.stiffness) ** 2 * 1e-3
+    cut = most - pull
+    assert rate(0.0) == pytest.approx(k * pull, rel=1e-9)  # nothing is cut: the error's integral
+    assert rate(cut * (1 - 1e-9)) == pytest.approx(rate(cut * (1 + 1e-9)), rel=1e-6)
+    assert rate(most) == pytest.approx(0.0, abs=1e-9 * k * most)
+    assert rate(2 * most) == pytest.approx(-k * most, rel=1e-9)
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,7 @@ class ClosedLoop:
         a = min(max(wanted, -most), ahead)
         limit = np.array(c["torque_limit"])
         torque = np.clip(table(p, "time", "torque", u) + g * a, -limit, limit)
-        return torque, c["integral"] * w**2 * (s_ref - s) if a == wanted else 0.0
+        return torque, c["integral"] * (a - 2 * w * (v_ref - v) - i)
 
     def observe(self, u, angles, memory):
         e, w = project(self.p, angles, memory[0]) - memory[0], self.c["observer"]

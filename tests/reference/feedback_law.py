@@ -52,8 +52,7 @@ class Law:
         ahead = min(most, p["press"]) if s_ref > length - p["reach"] else most
         wanted = w**2 * (s_ref - self.s) + 2 * w * (v_ref - self.v) + self.i
         a = np.clip(wanted, -most, ahead)
-        if a == wanted:
-            self.i += h * c["integral"] * w**2 * (s_ref - self.s)
+        self.i += h * c["integral"] * (a - 2 * w * (v_ref - self.v) - self.i)
         self.pressed, self.t = wanted >= ahead, t
         limit = np.array(c["torque_limit"])
         return np.clip(table(p, "time", "torque", u) + g * a, -limit, limit)

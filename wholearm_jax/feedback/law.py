@@ -3,9 +3,11 @@ r"""The law: torques from measured joint angles, sample after sample. NumPy alon
 At each sample the measured angles are projected onto the curve of the phase's joint angles; an observer of second
 order, which expects the reference's acceleration, makes of that the place `s` and the speed `v`; and the torque is
 
-    tau = tau_ref(t) + g(s) a,    a = w^2 (s_ref - s) + 2 w (v_ref - v) + i,    di/dt = k_i w^2 (s_ref - s)
+    tau = tau_ref(t) + g(s) a,    a = w^2 (s_ref - s) + 2 w (v_ref - v) + i,    di/dt = k (a - 2 w (v_ref - v) - i)
 
-with `t` since the phase began, as far as `|g a|` stays within the controller's `push`.
+with `t` since the phase began. `a` is cut where `|g a|` would exceed the controller's `push`: the integral part, which
+else has the rate `k w^2 (s_ref - s)`, then goes to what the cut leaves instead of winding up (Astrom and Rundqwist,
+Integrator windup and how to avoid it, ACC 1989, pp. 1693-1698), and its rate has no jump where the cut begins.
 """
 
 from typing import NamedTuple
@@ -61,9 +63,10 @@ def step(
     gain = _along(phase, state.s, phase.gain)
     most = controller.push / np.abs(gain).max()
     ahead = min(most, phase.press) if s_ref > phase.length - phase.reach else most
-    wanted = w**2 * (s_ref - state.s) + 2 * w * (v_ref - state.v) + state.i
+    damping = 2 * w * (v_ref - state.v)
+    wanted = w**2 * (s_ref - state.s) + damping + state.i
     a = min(max(wanted, -most), ahead)
-    i = state.i + h * controller.integral * w**2 * (s_ref - state.s) if a == wanted else state.i
+    i = state.i + h * controller.integral * (a - damping - state.i)
     torque = np.clip(torque + gain * a, -controller.torque_limit, controller.torque_limit)
     return state._replace(time=time, i=i, pressed=bool(wanted >= ahead)), torque
 

@@ -4,7 +4,7 @@ In continuous time the law of `docs/feedback.md` is an ordinary differential equ
 observed place and speed and the integral part, driven by the place `q` of the true joint angles:
 
     ds/dt = v + 2 w_o (q - s),    dv/dt = dv_ref/dt + w_o^2 (q - s)
-    di/dt = k w^2 (s_ref - s) where nothing is cut
+    di/dt = k (a - 2 w (v_ref - v) - i)    with the acceleration `a` asked for, after it was cut
 
 Along a path `q` is a function of the path's own parameter; the torque is one of time and memory.
 """
@@ -72,32 +72,31 @@ def _row_before(places: Float[Array, "rows"], at) -> Int[Array, ""]:
 
 
 def _act(loop: PhaseLoop, row, phase_time, memory):
-    """Return the feed-forward torque, the gain, the acceleration asked for, whether it was cut, and the error."""
+    """Return the feed-forward torque, the gain, the acceleration asked for, and the integral part's rate."""
     since = phase_time - take_row(loop.phase_time, row)
     now = take_row(loop.reference, row) + take_row(loop.slope, row) * since
     s, v, i = memory
     gain = interpolate_rows(loop.s, loop.gain, s)
     most = loop.push / jnp.abs(gain).max()
     ahead = jnp.where(take_row(loop.presses, row), jnp.minimum(most, loop.press), most)
-    error = loop.stiffness**2 * (now[0] - s)
-    wanted = error + 2 * loop.stiffness * (now[1] - v) + i
-    is_cut = (wanted > ahead) | (wanted < -most)
-    return now[2:], gain, jnp.minimum(jnp.maximum(wanted, -most), ahead), is_cut, error
+    damping = 2 * loop.stiffness * (now[1] - v)
+    wanted = loop.stiffness**2 * (now[0] - s) + damping + i
+    acceleration = jnp.minimum(jnp.maximum(wanted, -most), ahead)
+    return now[2:], gain, acceleration, loop.integral * (acceleration - damping - i)
 
 
 def torque_of(actuation: Actuation, row, phase_time, memory=None) -> Float[Array, "2"]:
     """Evaluate the torque [N m] of a schedule, or of a law with its memory, in an interval."""
     if not isinstance(actuation, PhaseLoop):
         return torque_at(actuation, row, phase_time)
-    torque, gain, acceleration, _, _ = _act(actuation, row, phase_time, memory)
+    torque, gain, acceleration, _ = _act(actuation, row, phase_time, memory)
     return jnp.clip(torque + gain * acceleration, -actuation.torque_limit, actuation.torque_limit)
 
 
 def memory_rate(actuation: PhaseLoop, dynamics: PathDynamics, duration, segment, row, phase_time, s, memory):
     """Evaluate the rate of the memory in phase time, where the path's parameter is `s`."""
     off = place_on_path(actuation, dynamics, segment, s) - memory[0]
-    *_, is_cut, error = _act(actuation, row, phase_time, memory)
-    integral = jnp.where(is_cut, 0.0, actuation.integral * error)
+    *_, integral = _act(actuation, row, phase_time, memory)
     rate = jnp.stack([memory[1] + 2 * actuation.observer * off, actuation.observer**2 * off, integral])
     return (duration * rate).at[1].add(take_row(actuation.slope, row)[1])
 
