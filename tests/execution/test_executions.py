@@ -85,7 +85,8 @@ def test_a_tip_touches_the_edge_that_it_is_least_deep_in(predictions):
     upper = [[0.02, 0.015], [0.0, -0.01], [-0.02, 0.015], [-0.021, 0.0]]  # with a notch
     table["object"]["vertices"] = [[-0.02, -0.015], [0.0, -0.016], [0.02, -0.015], *upper]
     edges = build_mujoco_model(parse(table), 1e-3).acting.edges
-    vector, rng, count = edges.length * edges.direction, np.random.default_rng(0), len(edges.start)
+    start, direction, rng = edges.origin / edges.toward, edges.toward.conj(), np.random.default_rng(0)
+    vector, count = edges.length * direction, len(start)
     np.testing.assert_array_equal(edges.convex, [True, True, True, False, True, True, True])
     left_to_others = 0
     for _ in range(2000):
@@ -95,11 +96,11 @@ def test_a_tip_touches_the_edge_that_it_is_least_deep_in(predictions):
             rng.uniform(0.05, 1.0) ** 8,
             rng.uniform(1e-7, 3e-6),
         )
-        tip = edges.start[k] + rng.choice([share, 1 - share]) * vector[k] + depth * 1j * edges.direction[k]
-        theta = np.angle(1j * edges.direction[k])
+        tip = start[k] + rng.choice([share, 1 - share]) * vector[k] + depth * 1j * direction[k]
+        theta = np.angle(1j * direction[k])
         lies = edges.joint[finger] + edges.tip[finger] * np.exp(1j * theta) - tip
         touches = _tip_touches(edges, np.array([lies.real, lies.imag, 0.0, theta, theta]))[finger]
-        place, along_k = (tip - edges.start) / vector, edges.direction / edges.direction[k]
+        place, along_k = (tip - start) / vector, direction / direction[k]
         others = [j for j, vertex in (((k - 1) % count, k - 1), ((k + 1) % count, k)) if edges.convex[vertex]]
         less_deep = [
             0 <= place[j].real <= 1 and 0 < place[j].imag * edges.length[j] < depth and along_k[j].real >= 0
@@ -117,8 +118,9 @@ def test_a_tip_beside_a_vertex_is_pushed_along_the_edges_normal(predictions, awa
     bodies = build_mujoco_model(scene, 2e-4)
     edges, data = bodies.acting.edges, mujoco.MjData(bodies.model)
     k = int(np.argmax(edges.length))
-    theta = np.angle(1j * edges.direction[k])
-    tip = edges.start[k] + (away + 1j * sunk) * edges.direction[k]
+    start, direction = edges.origin[k] / edges.toward[k], edges.toward[k].conj()
+    theta = np.angle(1j * direction)
+    tip = start + (away + 1j * sunk) * direction
     lies = edges.joint[0] + edges.tip[0] * np.exp(1j * theta) - tip
     data.qpos[:] = lies.real, lies.imag, 0.0, theta, theta - 2.0
     choose_pairs(bodies.model, bodies.acting, data.qpos)
@@ -127,7 +129,7 @@ def test_a_tip_beside_a_vertex_is_pushed_along_the_edges_normal(predictions, awa
     at = np.flatnonzero(rows == bodies.names.index(f"finger1:e{k}"))
     assert len(at) == 1
     into = data.contact.frame[at[0], :2] * bodies.toward[rows[at[0]]] @ AS_COMPLEX
-    assert abs(into - 1j * edges.direction[k]) < 1e-9
+    assert abs(into - 1j * direction) < 1e-9
     assert data.contact.dist[at[0]] == pytest.approx(-sunk, abs=1e-9)
 
 

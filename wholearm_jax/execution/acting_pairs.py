@@ -27,13 +27,16 @@ FAR_BELOW = 1e9  # how far below its margin a contact that is left out would act
 class EdgePairs:
     """Pairs of each fingertip and each edge: rows of MuJoCo's pairs, and places as `x + iy` [m].
 
-    Edges are in the object's frame; `convex` says it of the vertex at each one's end. Deeper than `depth` [m] a tip is
-    beyond an edge.
+    Edges are in the object's frame: a place `p` is `p * toward - origin` from where an edge begins, along the edge and
+    to the object's inside. `convex` says it of the vertex at each one's end, `after` and `before` are the edges at
+    either end. Deeper than `depth` [m] a tip is beyond an edge.
     """
 
     row: Int[np.ndarray, "fingers edges"]
-    start: Complex[np.ndarray, "edges"]
-    direction: Complex[np.ndarray, "edges"]  # of unit length
+    toward: Complex[np.ndarray, "edges"]  # of unit length
+    origin: Complex[np.ndarray, "edges"]
+    after: Int[np.ndarray, "edges"]
+    before: Int[np.ndarray, "edges"]
     length: Float[np.ndarray, "edges"]
     convex: Bool[np.ndarray, "edges"]
     joint: Complex[np.ndarray, "fingers"]
@@ -56,13 +59,20 @@ class VertexPairs:
 class FacePairs:
     """Pairs of a finger's dot and the faces of the other finger: that toward the object, and its back.
 
-    `row` has MuJoCo's pairs with either face, `finger` (0 or 1) is the one with the faces and `dot` the other one's
-    place in its own frame, whose x-axis is the finger, as `x + iy`.
+    `row` has MuJoCo's pairs with either face, `finger` (0 or 1) is the one with the faces, `length` [m] long and with
+    its joint at `joint`. They lie beside `middle` [m] in its frame, whose x-axis is the finger; `upward` is 1
+    or -1: that toward the object is above or below. `dot` is in the frame of the other finger, with its joint at
+    `dot_joint`. Places are `x + iy` [m].
     """
 
     row: Int[np.ndarray, "dots 2"]
     finger: Int[np.ndarray, "dots"]
+    joint: Complex[np.ndarray, "dots"]
+    length: Float[np.ndarray, "dots"]
+    middle: Float[np.ndarray, "dots"]
+    upward: Float[np.ndarray, "dots"]
     dot: Complex[np.ndarray, "dots"]
+    dot_joint: Complex[np.ndarray, "dots"]
 
 
 @dataclass(frozen=True)
@@ -72,7 +82,6 @@ class ActingPairs:
     edges: EdgePairs
     vertices: VertexPairs
     faces: FacePairs
-    hand: Hand
     gap: float
 
 
@@ -81,17 +90,20 @@ def acting_pairs(
 ) -> ActingPairs:
     """Return the pairs of a model, whose contacts are `names`, that act at some times only."""
     edges, vertices = _edge_pairs(model, names, solid, hand, depth), _vertex_pairs(model, names, solid, hand)
-    return ActingPairs(edges, vertices, _face_pairs(model, hand), hand, gap)
+    return ActingPairs(edges, vertices, _face_pairs(model, hand), gap)
 
 
 def _edge_pairs(model: mujoco.MjModel, names: tuple[str, ...], solid, hand: Hand, depth: float) -> EdgePairs:
     start = solid.vertices[: solid.count] @ AS_COMPLEX
     along = np.roll(start, -1) - start
     row, finger, _ = _finger_pairs(model, names, EDGE)
+    toward, number = along.conj() / np.abs(along), np.arange(len(start))
     return EdgePairs(
         row=np.stack([row[finger == k] for k in range(2)]),
-        start=start,
-        direction=along / np.abs(along),
+        toward=toward,
+        origin=start * toward,
+        after=np.roll(number, -1),
+        before=np.roll(number, 1),
         length=np.abs(along),
         convex=(np.roll(along, -1) / along).imag > 0,
         joint=np.asarray(hand.joint) @ AS_COMPLEX,
@@ -115,10 +127,16 @@ def _finger_pairs(model: mujoco.MjModel, names: tuple[str, ...], kind: int) -> I
 def _face_pairs(model: mujoco.MjModel, hand) -> FacePairs:
     dots = [] if hand.layered else [(k, name, at) for k in (0, 1) for name, at in link_dots(hand, k)]
     rows = [[model.pair(f"{name} on {face}").id for face in link_faces(1 - k)] for k, name, _ in dots]
+    finger, joint = np.array([1 - k for k, _, _ in dots], int), np.asarray(hand.joint) @ AS_COMPLEX
     return FacePairs(
-        np.array(rows, int).reshape(-1, 2),
-        np.array([1 - k for k, _, _ in dots], int),
-        np.array([complex(*at) for _, _, at in dots], complex),
+        row=np.array(rows, int).reshape(-1, 2),
+        finger=finger,
+        joint=joint[finger],
+        length=np.asarray(hand.length)[finger],
+        middle=np.asarray(hand.offset - hand.back)[finger] / 2,
+        upward=np.array([1.0, -1.0])[finger],
+        dot=np.array([complex(*at) for _, _, at in dots], complex),
+        dot_joint=joint[1 - finger],
     )
 
 
@@ -129,40 +147,45 @@ def choose_pairs(
 
     Faces are chosen anew where a dot is beyond the other finger's end, or `everywhere`.
     """
-    phi, angles = qpos[2], qpos[3:]
+    turn = np.exp(1j * qpos[2:])  # of the object, and of each finger
     vertices = acting.vertices
-    corner = qpos[0] + 1j * qpos[1] + vertices.vertex * np.exp(1j * phi)
-    along = ((corner - vertices.joint) * np.exp(-1j * angles)[vertices.finger]).real
+    corner = complex(*qpos[:2]) + vertices.vertex * turn[0]
+    along = ((corner - vertices.joint) * turn[1:].conj()[vertices.finger]).real
     _act(model, acting, vertices.row, along <= vertices.length)
     _act(model, acting, acting.edges.row, _tip_touches(acting.edges, qpos))
     if len(acting.faces.row):
-        _choose_faces(model, acting, angles, everywhere)
+        _choose_faces(model, acting, turn[1:], everywhere)
 
 
 def _tip_touches(edges: EdgePairs, qpos: Float[np.ndarray, "5"]) -> Bool[np.ndarray, "fingers edges"]:
     """Say which edges the fingertips touch if they come that near."""
-    turn = np.exp(1j * qpos[3:])
-    back = np.exp(-1j * qpos[2])
-    tip = (edges.joint + edges.tip * turn - qpos[0] - 1j * qpos[1]) * back
-    place = (tip[:, None] - edges.start) * edges.direction.conj()  # along the edge, and to the object's inside
+    turn = np.exp(1j * qpos[2:])
+    back, fingers = turn[0].conj(), turn[1:]
+    tip = (edges.joint + edges.tip * fingers - complex(*qpos[:2])) * back
+    place = np.multiply.outer(tip, edges.toward) - edges.origin
     along, inside = place.real, place.imag
-    from_outside = ((turn * back)[:, None] * edges.direction.conj()).imag >= 0
+    from_outside = np.multiply.outer(fingers * back, edges.toward).imag >= 0
     touches = from_outside & (along >= 0) & (along <= edges.length) & (inside < edges.depth)
     # At a convex vertex that the tip has sunk in from both sides, the less deep one.
-    sunk, after = touches & (inside > 0), np.roll(inside, -1, axis=1)
-    both = sunk & np.roll(sunk, -1, axis=1) & edges.convex
-    return touches & ~(both & (inside > after)) & ~np.roll(both & (inside <= after), 1, axis=1)
+    sunk = touches & (inside > 0)
+    both = sunk & sunk[:, edges.after] & edges.convex
+    if not both.any():
+        return touches
+    deeper = inside > inside[:, edges.after]
+    return touches & ~(both & deeper) & ~(both & ~deeper)[:, edges.before]
 
 
-def _choose_faces(model: mujoco.MjModel, acting: ActingPairs, angles: Float[np.ndarray, "2"], everywhere: bool) -> None:
+def _choose_faces(model: mujoco.MjModel, acting: ActingPairs, turn: Complex[np.ndarray, "2"], everywhere: bool) -> None:
     """Let dots that are beyond the other finger's end, or all, meet that of its faces on whose side they are."""
-    hand, faces = acting.hand, acting.faces
-    other, finger = 1 - faces.finger, faces.finger
-    turn, joint = np.exp(1j * angles), hand.joint @ AS_COMPLEX
-    dot = (joint[other] + faces.dot * turn[other] - joint[finger]) / turn[finger]  # in the frame of the faces
-    height = np.array([1.0, -1.0])[finger] * dot.imag  # toward the object
-    beyond = everywhere | (dot.real > hand.length[finger])
-    before = height > (hand.offset - hand.back)[finger] / 2
+    faces = acting.faces
+    dot = faces.dot_joint + faces.dot * turn[1 - faces.finger] - faces.joint
+    dot = dot * turn[faces.finger].conj()  # in the frame of the faces
+    beyond = dot.real > faces.length
+    if everywhere:
+        beyond[:] = True
+    if not beyond.any():
+        return
+    before = faces.upward * dot.imag > faces.middle
     _act(model, acting, faces.row[beyond], np.stack([before, ~before], axis=1)[beyond])
 
 

@@ -63,8 +63,9 @@ def advance(
     mujoco.mj_step2(bodies.model, data)
     if has_given_up(data):  # it has begun anew, and its contacts are others
         return np.full_like(before, np.nan), np.inf
-    forces = np.zeros_like(before)
-    np.add.at(forces, touching.pair, np.stack([data.efc_force[touching.address], friction], axis=1))
+    forces = np.zeros(before.shape)
+    np.add.at(forces[:, 0], touching.pair, data.efc_force[touching.address])
+    np.add.at(forces[:, 1], touching.pair, friction)
     return forces, wrong
 
 
@@ -122,25 +123,22 @@ def _active_set_forces(
     where `c` is `EXACT` squared of how mobile the contact is, so that friction is determined where several contacts
     stick.
     """
-    sticks, count = slides == 0, np.count_nonzero(slides == 0)
-    jacobian, stiffness = data.efc_J.reshape(-1, 5)[: len(yields)], np.where(yields, data.efc_D, 0.0)
-    normal, a_ref, stiff = (each[touching.address] for each in (jacobian, data.efc_aref, stiffness))
+    sticks, all_a_ref, address = slides == 0, data.efc_aref, touching.address
+    jacobian, stiffness = data.efc_J.reshape(-1, 5)[: len(yields)], yields * data.efc_D
+    normal, a_ref, stiff = jacobian[address], all_a_ref[address], stiffness[address]
     # All forces but those of constraints that yield and of contacts that slide, which follow the accelerations.
-    force = data.qfrc_smooth - ct[~sticks] @ touching.slip[~sticks] + np.where(yields, 0.0, data.efc_force) @ jacobian
+    force = data.qfrc_smooth - (ct * ~sticks) @ touching.slip
+    force += (~yields * data.efc_force + stiffness * all_a_ref) @ jacobian
     sliding = touching.slip * (slides * touching.friction * stiff)[:, None]
-    system = np.zeros((5 + count, 5 + count))
-    system[:5, :5] = (jacobian.T * stiffness) @ jacobian + sliding.T @ normal
-    system[:5, :5] += np.diag(1 / bodies.mobility)
-    system[:5, 5:], system[5:, :5] = -touching.slip[sticks].T, bodies.model.opt.timestep * touching.slip[sticks]
-    system[5:, 5:] = np.diag(EXACT**2 * touching.mobility[sticks])
-    known = np.append(
-        force + (stiffness * data.efc_aref) @ jacobian + a_ref @ sliding, -touching.slip[sticks] @ data.qvel
-    )
-    solution = np.linalg.solve(system, known)
+    # Unknown are accelerations and, where contacts stick, changes of friction; elsewhere these are 0.
+    sticking = touching.slip * sticks[:, None]
+    system = np.diag(np.concatenate([1 / bodies.mobility, np.where(sticks, EXACT**2 * touching.mobility, 1.0)]))
+    system[:5, :5] += (jacobian.T * stiffness) @ jacobian + sliding.T @ normal
+    system[:5, 5:], system[5:, :5] = -sticking.T, bodies.model.opt.timestep * sticking
+    solution = np.linalg.solve(system, np.concatenate([force + a_ref @ sliding, -sticking @ data.qvel]))
     most = touching.friction * np.maximum(stiff * (a_ref - normal @ solution[:5]), 0.0)
-    found = slides * most
-    found[sticks] = np.clip(ct[sticks] + solution[5:], -most[sticks], most[sticks])
-    return found
+    held = np.minimum(np.maximum(ct + solution[5:], -most), most)
+    return np.where(sticks, held, slides * most)
 
 
 def _touching(bodies: MujocoModel, data) -> Touching:
@@ -156,13 +154,10 @@ def _touching(bodies: MujocoModel, data) -> Touching:
     if not on_object.all():
         touching, pair = touching[on_object], pair[on_object]
     normal = contact.frame[touching, :2] * bodies.toward[pair, None]
-    tangent_x, tangent_y = normal[:, 1], -normal[:, 0]
-    x, y = contact.pos[touching, :2].T
-    rows = np.zeros((len(touching), 5))
-    rows[:, 0], rows[:, 1] = tangent_x, tangent_y
-    rows[:, 2] = tangent_y * (x - data.qpos[0]) - tangent_x * (y - data.qpos[1])
-    for finger, (joint_x, joint_y) in enumerate(bodies.acting.hand.joint):
-        turning = tangent_x * (y - joint_y) - tangent_y * (x - joint_x)
-        rows[:, 3 + finger] = np.where(bodies.link[pair] == finger + 1, turning, 0.0)
+    height = (normal * contact.pos[touching, :2]).sum(1)  # along the normal
+    rows = np.empty((len(touching), 5))
+    rows[:, 0], rows[:, 1] = normal[:, 1], -normal[:, 0]
+    rows[:, 2] = normal @ data.qpos[:2] - height
+    rows[:, 3:] = (height[:, None] - normal @ bodies.joint.T) * bodies.turns[pair]
     mobility = bodies.model.opt.timestep * np.abs((rows * bodies.mobility) @ rows.T).sum(1)
     return Touching(pair, contact.efc_address[touching], rows, bodies.friction[pair], mobility)

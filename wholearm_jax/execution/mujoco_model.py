@@ -37,7 +37,7 @@ from typing import Literal
 import jax
 import mujoco
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from wholearm_jax.execution.acting_pairs import ActingPairs, acting_pairs, choose_pairs, link_dots, link_faces
 from wholearm_jax.model import (
@@ -96,9 +96,9 @@ class MujocoModel:
 
     `pair[geom1, geom2]` is the row of `names`, or after them of `link_meetings`, that two shapes belong to (-1: none);
     `toward[row]` is 1 where MuJoCo's contact normal points into the object and -1 where it points out of it. Each row
-    of `names` has its `link` and its `friction` coefficient; `acting` says which pairs act when, and
-    `mobility` is the diagonal of `M^-1`. `xml` is the model as MJCF, always with MuJoCo's friction and without
-    `LINK_GIVE`, which MJCF cannot say.
+    of `names` says which finger `turns` with its contact, about its `joint`, and has a `friction` coefficient. `acting`
+    says which pairs act, and `mobility` is the diagonal of `M^-1`. `xml` is the model as MJCF, always with MuJoCo's
+    friction and without `LINK_GIVE`, which MJCF cannot say.
     """
 
     model: mujoco.MjModel
@@ -107,7 +107,8 @@ class MujocoModel:
     link_meetings: tuple[str, ...]
     pair: Int[np.ndarray, "geoms geoms"]
     toward: Int[np.ndarray, "rows"]
-    link: Int[np.ndarray, "rows"]
+    joint: Float[np.ndarray, "2 2"]
+    turns: Bool[np.ndarray, "rows 2"]
     friction: Float[np.ndarray, "rows"]
     mobility: Float[np.ndarray, "5"]
     softness: ContactCompliance
@@ -148,7 +149,8 @@ def build_mujoco_model(scene: Scene, timestep: float, softness: ContactComplianc
         link_meetings=link_meetings,
         pair=pair,
         toward=toward,
-        link=link,
+        joint=np.asarray(hand.joint),
+        turns=link[:, None] == np.array([1, 2]),
         friction=np.asarray(solid.friction)[link],
         mobility=1 / inertia,
         softness=softness,

@@ -60,8 +60,8 @@ def step(
     s_ref += state.offset * max(0.0, 1.0 - since / phase.duration)
     # Act, within the bound of the feedback's torque.
     w = controller.stiffness
-    gain = _along(phase, state.s, phase.gain)
-    most = controller.push / np.abs(gain).max()
+    (gain,) = _interpolate(phase.s, state.s, phase.gain)
+    most = controller.push / max(abs(gain[0]), abs(gain[1]))
     ahead = min(most, phase.press) if s_ref > phase.length - phase.reach else most
     damping = 2 * w * (v_ref - state.v)
     wanted = w**2 * (s_ref - state.s) + damping + state.i
@@ -78,16 +78,14 @@ def project_on_path(phase: PhaseLaw, angles, s: float) -> float:
     """
     for _ in range(PROJECTIONS):
         inside = min(max(s, 0.0), phase.length)
-        tangent = _along(phase, inside, phase.tangent)
-        there = _along(phase, inside, phase.theta) + (s - inside) * tangent
-        s = s + float(tangent @ (angles - there))
+        theta, tangent = _interpolate(phase.s, inside, phase.theta, phase.tangent)
+        s = s + float(tangent @ (angles - theta - (s - inside) * tangent))
     return s
 
 
 def reference(phase: PhaseLaw, since: float) -> tuple[float, float, Float[np.ndarray, "2"]]:
     """Return the reference's place and speed, and its torques, at a time since the phase began."""
-    s_ref, v_ref = np.interp(since, phase.time, phase.s_ref), np.interp(since, phase.time, phase.v_ref)
-    torque = np.array([np.interp(since, phase.time, phase.torque[:, k]) for k in range(2)])
+    s_ref, v_ref, torque = _interpolate(phase.time, since, phase.s_ref, phase.v_ref, phase.torque)
     late = since - phase.duration
     if late > 0:
         v_ref = phase.approach if phase.approach * late < phase.reach else 0.0
@@ -95,9 +93,12 @@ def reference(phase: PhaseLaw, since: float) -> tuple[float, float, Float[np.nda
     return float(s_ref), float(v_ref), torque
 
 
-def _along(phase: PhaseLaw, s: float, table) -> Float[np.ndarray, "2"]:
-    """Interpolate a table along the path."""
-    return np.array([np.interp(s, phase.s, table[:, k]) for k in range(2)])
+def _interpolate(nodes: Float[np.ndarray, "nodes"], at: float, *tables: Float[np.ndarray, "nodes *shape"]) -> list:
+    """Interpolate tables linearly; they are constant beyond their ends."""
+    k = min(max(int(nodes.searchsorted(at, side="right")) - 1, 0), len(nodes) - 2)
+    gap = nodes[k + 1] - nodes[k]
+    share = min(max((at - nodes[k]) / gap, 0.0), 1.0) if gap > 0 else 1.0
+    return [table[k] + share * (table[k + 1] - table[k]) for table in tables]
 
 
 def _observe(controller: Controller, state: LawState, time: float, angles) -> LawState:
@@ -107,7 +108,7 @@ def _observe(controller: Controller, state: LawState, time: float, angles) -> La
     """
     phase, h = controller.phases[state.phase], time - state.time
     r = np.exp(-controller.observer * h)
-    before, now = np.interp([state.time - state.began, time - state.began], phase.time, phase.v_ref)
+    before, now = (_interpolate(phase.time, at - state.began, phase.v_ref)[0] for at in (state.time, time))
     faster = now - before
     predicted = state.s + h * (state.v + faster / 2)
     off = project_on_path(phase, angles, predicted) - predicted
@@ -128,6 +129,6 @@ def _change_phase(controller: Controller, state: LawState, time: float, angles) 
         return state._replace(arrived=True)
     following = controller.phases[state.phase + 1]
     s = project_on_path(following, angles, 0.0)
-    turn = float(_along(phase, phase.length, phase.tangent) @ _along(following, 0.0, following.tangent))
+    turn = float(phase.tangent[-1] @ following.tangent[0])
     v = state.v * turn if phase.flows else 0.0
     return LawState(state.phase + 1, time, time, s, v, s - float(following.s_ref[0]), 0.0, 0.0, False, False)
