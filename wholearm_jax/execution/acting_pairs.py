@@ -60,7 +60,7 @@ class FacePairs:
     """Pairs of a finger's dot and the faces of the other finger: that toward the object, and its back.
 
     `row` has MuJoCo's pairs with either face, `finger` (0 or 1) is the one with the faces, `length` [m] long and with
-    its joint at `joint`. They lie beside `middle` [m] in its frame, whose x-axis is the finger; `upward` is 1
+    its joint at `joint`. They lie above and below `middle` [m] in its frame, whose x-axis is the finger; `upward` is 1
     or -1: that toward the object is above or below. `dot` is in the frame of the other finger, with its joint at
     `dot_joint`. Places are `x + iy` [m].
     """
