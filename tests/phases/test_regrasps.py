@@ -6,15 +6,16 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from scipy.optimize import linprog
+from scipy.optimize import brentq, linprog
 
 import wholearm_jax as wa
 from wholearm_jax.core import SceneError
 from wholearm_jax.ensembles import make_ensemble, optimise_robustly
-from wholearm_jax.execution.executions import ExecutionOutcome, execute
+from wholearm_jax.execution.executions import ExecutionOutcome, execute, rollout
+from wholearm_jax.execution.mujoco_model import build_mujoco_model
 from wholearm_jax.files import load_start
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.margin import contact_statics, without_joint
+from wholearm_jax.margin import contact_statics, rest_margin, without_joint
 from wholearm_jax.model import contact_formation
 from wholearm_jax.phases import describe_end
 
@@ -116,6 +117,24 @@ def test_the_margin_of_a_hold_without_a_finger_is_that_of_a_programme_of_its_own
     ours = without_joint(contact_statics(scene, contact_formation(names), z), moving).best().margin
     fingers = sorted({int(name[6]) for name in names if name.startswith("finger")})
     assert ours == pytest.approx(independent_margin(scene, z, names, fingers), abs=1e-9)
+
+
+def test_a_push_topples_the_object_where_the_margin_is_negative_and_not_where_it_is_positive(data, optimum):
+    """Finger 2 alone pushes it on a palm that it does not slide on: free bodies in MuJoCo stay, or fall over."""
+    scene = wa.parse(data)
+    scene = eqx.tree_at(lambda s: s.object.friction, scene, np.array([1.0, 0.1, 0.1]))
+    z = np.asarray(optimum.result.phases[0].traced.end)  # finger 1 is away
+    statics = without_joint(contact_statics(scene, contact_formation(["palm:v3", "palm:v4", "finger2:v2"]), z), 1)
+
+    def margin(push):
+        return rest_margin(statics, wa.torque_schedule([0.0, 1.0], [[0.0, push]] * 2), 0.0, 1.0).margin
+
+    limit, bodies = brentq(margin, -0.1, -0.01, xtol=1e-9), build_mujoco_model(scene, 2e-4)
+    for share, topples in ((0.97, False), (1.03, True)):
+        assert (margin(share * limit) < 0) == topples
+        course, *_ = rollout(bodies, z, np.tile([0.0, share * limit], (2500, 1)))
+        turned = np.abs(course[-1, 2] - course[0, 2])
+        assert turned > 5e-3 if topples else turned < 5e-5
 
 
 def test_one_finger_at_a_time_moves(optimum):
