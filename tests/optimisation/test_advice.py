@@ -56,6 +56,19 @@ def test_too_few_knots_are_named_with_a_number_that_works(heptagon):
     assert wa.optimise(heptagon, knots=KNOTS).result.status is wa.Status.OK
 
 
+def test_phases_without_a_stop_that_are_too_slow_are_told_durations_that_work():
+    scene = wa.load("flight")
+    for k, phase in enumerate(scene.phases):
+        scene = with_duration(scene, k, 30 * float(phase.duration))
+    slow = wa.optimise(scene).result
+    (said,) = {phase.message.partition("so slowly")[2] for phase in slow.phases if phase.status is not wa.Status.OK}
+    advised = re.findall(r"--set (\d)\.duration=([\d.]+)", said)
+    assert [int(k) for k, _ in advised] == [0, 1, 2]
+    for k, seconds in advised:
+        scene = with_duration(scene, int(k), float(seconds))
+    assert wa.optimise(scene).result.status is wa.Status.OK
+
+
 def test_another_schedule_is_advised_to_be_optimised(heptagon):
     still = wa.simulate(heptagon, wa.torque_schedule([0.0, 2.0], [[0.0, 0.0], [0.0, 0.0]]))
     for phase in explain(still).phases:

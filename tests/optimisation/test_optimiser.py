@@ -1,5 +1,6 @@
 """The main job: optimised plans against the certified bound, their limits, and the search by steps of 10 %."""
 
+import importlib
 import threading
 import time
 
@@ -46,6 +47,20 @@ def test_the_schedule_alone_carries_the_plan_out_within_its_limits(optimised):
     for phase in again.phases:
         motion, dynamics = phase.outcome.motion, phase.traced.dynamics
         assert abs(float(motion.s[motion.count] - dynamics.breakpoints[-1])) <= DEFAULT_ARRIVAL * float(dynamics.length)
+
+
+def test_a_phase_gets_more_knots_where_they_cost_margin(monkeypatch):
+    """And only there; a number that is given is kept."""
+    module = importlib.import_module("wholearm_jax.optimisation.optimiser")
+    monkeypatch.setattr(module, "DEFAULT_KNOTS", 11)
+    monkeypatch.setattr(module, "MOST_KNOTS", 21)
+    given, chosen = wa.optimise(wa.load("hexagon"), knots=11), wa.optimise(wa.load("hexagon"))
+    assert given.bound_fraction[0] == pytest.approx(chosen.bound_fraction[0], abs=1e-6) == pytest.approx(1.0, abs=1e-2)
+    assert given.bound_fraction[1] < 0.98 < 0.99 < chosen.bound_fraction[1]
+    assert (given.knots, chosen.knots) == (11, 21)
+    spacing = np.diff(np.asarray(chosen.torque.times))
+    np.testing.assert_allclose(spacing[:10], 0.1)
+    np.testing.assert_allclose(spacing[-20:], 0.05)
 
 
 def test_history_says_what_happened(optimised):

@@ -29,7 +29,9 @@ def optimise(
     scene: SceneName,
     out: OutputFolder = None,
     set_: Changes = None,
-    knots: Annotated[int, typer.Option(min=3, help="Torque knots a phase.")] = 51,
+    knots: Annotated[
+        int | None, typer.Option(min=3, help="Torque knots a phase (51, and up to 201 where those cost margin).")
+    ] = None,
     steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 160,
     rate_limit: Annotated[float | None, typer.Option(min=1e-9, help="Largest torque rate [N m/s].")] = None,
     margin: Annotated[
@@ -67,7 +69,9 @@ def optimise(
         if unknown:
             raise BadInput(f"--robust: knows no --{unknown[0]}")
         ensemble = parse_ensemble(loaded, robust, seed)
-        _optimise_ensemble(ensemble, folder, samples or 64, knots, steps, arrival, report, as_json)
+        from wholearm_jax.optimisation import DEFAULT_KNOTS
+
+        _optimise_ensemble(ensemble, folder, samples or 64, knots or DEFAULT_KNOTS, steps, arrival, report, as_json)
     from wholearm_jax.optimisation import MIN_TRANSITION_SPEED
 
     passing = MIN_TRANSITION_SPEED if passing is None else passing
@@ -76,7 +80,7 @@ def optimise(
     optimum = _optimise_scene(scene, loaded, options)
     more = {
         "command": "optimise",
-        "knots": knots,
+        "knots": optimum.knots,
         "steps": len(optimum.history),
         "seconds": time.perf_counter() - begun,
     }
@@ -152,10 +156,10 @@ def _what_holds(held, uncertain: dict[str, float]) -> str:
 
 def _optimise_scene(name: str, scene, options: dict):
     """Trace and optimise one scene, with a progress bar for each phase."""
+    from wholearm_jax.optimisation import DEFAULT_KNOTS, precompile_optimise
     from wholearm_jax.optimisation import optimise as solve
-    from wholearm_jax.optimisation import precompile_optimise
 
-    precompile_optimise(scene, knots=options["knots"])
+    precompile_optimise(scene, knots=options["knots"] or DEFAULT_KNOTS)
     traced = trace_or_exit(name, scene)
     with solver_progress() as progress:
         bars = [progress.add_task(p.name, total=options["steps"], state="waiting") for p in scene.phases]

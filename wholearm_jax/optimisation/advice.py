@@ -17,11 +17,19 @@ import numpy as np
 from wholearm_jax.core import Status
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.margin import MarginBound, affine_coefficients, best_quasistatic_torque
-from wholearm_jax.model import Arrival
-from wholearm_jax.optimisation.best_motion import shortest_motions
+from wholearm_jax.model import Arrival, Scene
+from wholearm_jax.optimisation.best_motion import convex_bounds, shortest_motions
 from wholearm_jax.optimisation.quasistatic_plan import bounds
 from wholearm_jax.optimisation.singular_advice import explain_singular
-from wholearm_jax.phases import HandOver, PhaseResult, Result, TracedPhase, configuration, find_hand_overs
+from wholearm_jax.phases import (
+    HandOver,
+    PhaseResult,
+    Result,
+    TracedPhase,
+    configuration,
+    find_hand_overs,
+    group_phases,
+)
 
 REMEDY_BOUND = "lower the friction or raise the torque limits, turn the object another way, or choose other contacts"
 REMEDY_LIMITS = "raise the torque limits, lower the friction, or choose other contacts"
@@ -29,6 +37,9 @@ REMEDY_LOST_HAND_OVER = "hand over elsewhere: choose other contacts, or fingers 
 REMEDY_OPTIMISE = "`wholearm optimise` looks for torques that work"
 SPARE_TIME = 1.5  # a phase should have this much more time than its fastest motion takes
 MIN_KNOTS = 11  # fewer are too few for most phases
+ENOUGH_MARGIN = 0.9  # share of the largest margin with which phases at speed are fast enough
+AMPLE_TIME = 10.0  # time of such a phase, over its fastest motion with that margin, that torques lead it through
+LONG_SHARE = 0.5  # ample time as a share of a duration that is long
 
 
 @dataclass(frozen=True)
@@ -81,7 +92,8 @@ def explain(
         elif motion is not None:
             at_speed = [j for j in (k - 1, k) if j >= 0 and phases[j].arrive is Arrival.MOVING]
             stop = phases[at_speed[0]].name if at_speed else None
-            detail, remedy = _explain_motion(k, phases[k], motion.duration, search, stop)
+            shorter = _shorter_durations(result.scene, traced, k) if at_speed and search is not None else {}
+            detail, remedy = _explain_motion(k, phases[k], motion.duration, search, stop, shorter)
             phases[k] = replace(phases[k], detail=detail or phases[k].detail, remedy=remedy)
     return replace(result, phases=tuple(phases))
 
@@ -124,12 +136,18 @@ def _no_torque_holds(phase: PhaseResult, bound: float) -> bool:
 
 
 def _explain_motion(
-    number: int, phase: PhaseResult, fastest: float, search: Search | None, stop: str | None = None
+    number: int,
+    phase: PhaseResult,
+    fastest: float,
+    search: Search | None,
+    stop: str | None = None,
+    shorter: Mapping[int, float] = MappingProxyType({}),
 ) -> tuple[str | None, str | None]:
     """Return cause and remedy of a phase that torques could hold at rest anywhere; `fastest` [s] is its fastest motion.
 
     The fastest motion presses every contact and stays within the torque limits; it is infinite where there is none.
-    `stop` names the phase whose end the object passes at speed, where it does.
+    `stop` names the phase whose end the object passes at speed, where it does; `shorter` are durations [s] of such
+    phases, by number, where theirs are long.
     """
     longer = (
         f"--set {number}.duration={round_up_digits(SPARE_TIME * fastest) if math.isfinite(fastest) else math.inf:g}"
@@ -141,6 +159,9 @@ def _explain_motion(
         return detail, f"give it more time ({longer})"
     if search is None:
         return phase.detail, f"{_first_half(phase)}; {REMEDY_OPTIMISE}"
+    if shorter:
+        changes = " ".join(f"--set {k}.duration={duration:g}" for k, duration in shorter.items())
+        return "so slowly no torques led it through the phases without a stop", f"give them less time ({changes})"
     if phase.status is Status.MAX_STEPS:
         return phase.detail, None
     possible = f"a motion of {fastest:.3g} s or longer exists"
@@ -155,6 +176,19 @@ def _explain_motion(
     return f"{possible}, but {search.knots} knots did not lead to it", (
         f"take more knots (--knots {max(MIN_KNOTS, 2 * search.knots)})"
     )
+
+
+def _shorter_durations(scene: Scene, traced: tuple[TracedPhase, ...], number: int) -> dict[int, float]:
+    """Return shorter durations [s] of the phases that phase `number` is coupled with; none where they are not long."""
+    group = next(group for group in group_phases(scene) if number in group)
+    best = [motion for k, motion in enumerate(convex_bounds(scene, any_duration=True, traced=traced)) if k in group]
+    level = ENOUGH_MARGIN * min((motion.margin for motion in best if motion is not None), default=-math.inf)
+    if not level > 0:
+        return {}
+    fastest = shortest_motions(scene, level, traced=traced)
+    durations = {k: float(scene.phases[k].duration) for k in group}
+    share = max(AMPLE_TIME * motion.duration / durations[k] for k in group if (motion := fastest[k]) is not None)
+    return {k: round_up_digits(share * duration) for k, duration in durations.items()} if share < LONG_SHARE else {}
 
 
 def _first_half(phase: PhaseResult) -> str:

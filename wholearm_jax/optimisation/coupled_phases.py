@@ -8,8 +8,8 @@ Derivation: section 9 of `docs/derivation.md`.
 """
 
 import functools
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -26,6 +26,7 @@ from wholearm_jax.model import (
     TorqueSchedule,
     concatenate_schedules,
     pad_schedule,
+    round_up,
     uniform_schedule,
 )
 from wholearm_jax.optimisation.constraints import Limits
@@ -52,13 +53,15 @@ class GroupSolution(NamedTuple):
     reason: str  # why iterations ended
     history: list[IterationRecord]
     score: tuple[bool, float] = (False, -np.inf)  # whether the simulation is `ok`, and its least margin over its bound
+    knots: int = 2  # of each phase
 
 
 @dataclass(frozen=True)
 class OptimiseOptions:
     """Arguments of `optimise`."""
 
-    knots: int
+    knots: int  # of each phase, and
+    most_knots: int  # as many as there may be where fewer cost margin
     schedule_rows: int  # of the whole plan's schedule: plans with equal rows share programs
     steps: int
     rate_limit: float | None
@@ -67,6 +70,13 @@ class OptimiseOptions:
     optimiser: optax.GradientTransformation | None
     tolerance: float
     callback: Callable[[IterationRecord], None] | None
+
+    def refinements(self, scene: Scene) -> Iterator["OptimiseOptions"]:
+        """Yield the same options with as many knots, and with half as long intervals as long as there may be such."""
+        knots = self.knots
+        while knots <= self.most_knots:
+            yield replace(self, knots=knots, schedule_rows=schedule_rows(scene, knots))
+            knots = 2 * knots - 1
 
 
 @dataclass(frozen=True)
@@ -125,6 +135,11 @@ class CoupledPhases:
         return np.array([float(bound.value) for bound in self.margin_bounds])
 
 
+def schedule_rows(scene: Scene, knots: int) -> int:
+    """Return the rows that the whole plan's schedule may have, with two for a wait before each phase."""
+    return round_up((knots + 2) * len(scene.phases))
+
+
 def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> GroupSolution:
     """Solve from one initial guess after the other, until one comes near the bound or two agree.
 
@@ -148,7 +163,7 @@ def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> GroupSolution:
     reason = f"within {options.tolerance:g} of the bound" if near_bound else best.reason
     # Where iterations end without torques, the phase is simulated under those of its first guess, which are in limits.
     found = best.p if np.isfinite(np.asarray(best.p.torque)).all() else guesses[0]
-    return GroupSolution(_schedules(group, found), reason, history, best[:2])
+    return GroupSolution(_schedules(group, found), reason, history, best[:2], options.knots)
 
 
 class _Candidate(NamedTuple):

@@ -57,17 +57,19 @@ from wholearm_jax.model import (
 )
 from wholearm_jax.optimisation.advice import Search, explain
 from wholearm_jax.optimisation.best_motion import convex_bounds
-from wholearm_jax.optimisation.convex_start import ConvexStart, convex_starts
+from wholearm_jax.optimisation.convex_start import convex_starts
 from wholearm_jax.optimisation.coupled_phases import (
+    GOOD_BOUND_FRACTION,
     MIN_DURATION_FRACTION,
     CoupledPhases,
     GroupSolution,
     OptimiseOptions,
+    schedule_rows,
     solve_coupled_phases,
 )
 from wholearm_jax.optimisation.plan_limits import limit_by_hand_overs, tighten_bounds, too_short_phases
 from wholearm_jax.optimisation.plan_transitions import holding_schedule, rest_transitions
-from wholearm_jax.optimisation.precompilation import precompile_optimise, schedule_rows
+from wholearm_jax.optimisation.precompilation import precompile_optimise
 from wholearm_jax.optimisation.quasistatic_plan import bounds, require_knots
 from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.optimisation.shortest_plan import shortest_plan
@@ -85,6 +87,7 @@ from wholearm_jax.phases import (
 )
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
+DEFAULT_KNOTS, MOST_KNOTS = 51, 201  # of a phase, where their number is not given
 MAX_DWELLS = (0.25, 0.1)  # fractions of a phase for which the object may wait before it starts, at limited rates
 MIN_TRANSITION_SPEED = 0.2  # least speed with which a phase is entered at speed, over its mean speed
 
@@ -99,6 +102,7 @@ class OptimisationResult:
     bounds: tuple[MarginBound, ...]  # of each phase
     stopped: tuple[str, ...]  # why the iterations of each phase ended
     history: tuple[IterationRecord, ...]  # all iterations
+    knots: int  # torque knots of the phase that has most
 
     @property
     def bound_fraction(self) -> tuple[float, ...]:
@@ -120,7 +124,7 @@ class PlanLimits(NamedTuple):
 def optimise(
     scene: Scene,
     *,
-    knots: int = 51,
+    knots: int | None = None,
     steps: int = 160,
     rate_limit: float | None = None,
     durations: tuple[float, float] | None = None,
@@ -135,12 +139,13 @@ def optimise(
 
     Each phase must arrive at its planned end in time: at speed where the next phase continues the motion, otherwise at
     rest, also where the plan allows any speed. Torques are linear between evenly spaced knots and stay within the
-    scene's limits. A phase that holds the object keeps its duration and gets the best torque of its statics. Where no
-    torque can hold a contact formation, nothing is searched and the status says so.
+    scene's limits. There are 51 knots a phase, and up to 201 where a phase between rests stays more than 1 % below its
+    bound with fewer. A phase that holds the object keeps its duration and gets the best torque of its statics. Where
+    no torque can hold a contact formation, nothing is searched and the status says so.
 
     Args:
         scene: the plan.
-        knots: torque knots a phase, at least two.
+        knots: torque knots of every phase instead, at least two.
         steps: most iterations from each initial guess.
         rate_limit: largest torque rate [N m/s]. Torques then do not jump between phases either, and the object may
             wait, held by friction, for up to a quarter of a phase until the torque moves it (`rest_transition`).
@@ -165,7 +170,8 @@ def optimise(
     ('ok', ['1.00', '1.00'])
     """
     require_x64(scene)
-    require_knots(knots)
+    first_knots, most_knots = (DEFAULT_KNOTS, MOST_KNOTS) if knots is None else (knots, knots)
+    require_knots(first_knots)
     rate_limit = None if rate_limit == np.inf else rate_limit
     require_positive(steps=steps, tolerance=tolerance, rate_limit=np.inf if rate_limit is None else rate_limit)
     parked = next((phase.name for phase in scene.phases if phase.formation.away), None)
@@ -179,7 +185,7 @@ def optimise(
         scene, durations = _with_durations(scene, durations[0]), None
 
     # Compile while paths are traced.
-    compiled = precompile_optimise(scene, knots=knots, optimiser=optimiser)
+    compiled = precompile_optimise(scene, knots=first_knots, optimiser=optimiser)
     traced = traced or trace(scene)
     if any(int(path.dynamics.status) == Status.OK for path in traced):
         wait_for(*compiled)
@@ -205,8 +211,10 @@ def optimise(
         too_short_phases(longest, pointwise, motions, traced),
     )
 
-    rows, heard = schedule_rows(scene, knots), callback and _one_at_a_time(callback)
-    options = OptimiseOptions(knots, rows, steps, rate_limit, durations, passing, optimiser, tolerance, heard)
+    rows, heard = schedule_rows(scene, first_knots), callback and _one_at_a_time(callback)
+    most_knots = first_knots if rate_limit is not None or optimiser is not None else most_knots
+    count = first_knots, most_knots, rows
+    options = OptimiseOptions(*count, steps, rate_limit, durations, passing, optimiser, tolerance, heard)
     results = []
     for max_dwell in MAX_DWELLS if rate_limit is not None else MAX_DWELLS[:1]:
         results.append(_solve_plan(scene, traced, limits, options, max_dwell))
@@ -240,11 +248,12 @@ def _solve_plan(
     durations = [float(np.asarray(schedule.times)[-1]) for schedule in schedules]
     phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, durations, strict=True))
     scene, torque = eqx.tree_at(lambda s: s.phases, scene, phases), concatenate_schedules(schedules)
-    simulated = simulate_phases(scene, torque, traced, with_step_capacity(IntegratorOptions(), options.knots))
-    search = Search(options.knots, options.rate_limit is not None)
+    knots = max(options.knots, *(found.knots for found in solutions))
+    simulated = simulate_phases(scene, torque, traced, with_step_capacity(IntegratorOptions(), knots))
+    search = Search(knots, options.rate_limit is not None)
     result = build_result(scene, torque, traced, simulated)
     result = explain(result, margin_bounds=limits.pointwise, search=search, too_short=limits.too_short)
-    return OptimisationResult(scene, torque, result, margin_bounds, tuple(stopped), tuple(history))
+    return OptimisationResult(scene, torque, result, margin_bounds, tuple(stopped), tuple(history), knots)
 
 
 def _solve_group(
@@ -266,19 +275,27 @@ def _solve_group(
         return GroupSolution(schedules, f"phase '{scene.phases[short[0]].name}' is too short for any motion", [])
     margin_bounds: list[MarginBound] = [limits.bounds[k] for k in group]
     hand_over = limits.hand_overs[group[0]]
-    starts: list[ConvexStart] = []
-    if len(group) == 1 and int(paths[0].dynamics.status) == Status.OK and float(margin_bounds[0].value) > 0:
-        may_wait = options.rate_limit is None and options.durations is None
-        moving = float(phases[0].duration) - (ends[0].dwell_time if ends[0] is not None else 0.0)
-        starts = convex_starts(scene, phases[0], paths[0], moving, options.knots, may_wait, hand_over)
+    if len(group) > 1 or int(paths[0].dynamics.status) != Status.OK or not float(margin_bounds[0].value) > 0:
+        coupled = CoupledPhases(group[0], phases, paths, margin_bounds, *ends, hand_over, None, True, 0, options)
+        return solve_coupled_phases(scene, coupled)
+
+    # A single phase: from its convex optimum, with more knots where they cost margin.
+    may_wait = options.rate_limit is None and options.durations is None
+    moving = float(phases[0].duration) - (ends[0].dwell_time if ends[0] is not None else 0.0)
     solutions: list[GroupSolution] = []
-    for convex in starts or [None]:
-        only, tried = len(starts) <= 1, len(solutions)
-        coupled = CoupledPhases(group[0], phases, paths, margin_bounds, *ends, hand_over, convex, only, tried, options)
-        solutions.append(solve_coupled_phases(scene, coupled))
-        if solutions[-1].score >= (True, 1 - options.tolerance):
+    for finer in options.refinements(scene):
+        starts = convex_starts(scene, phases[0], paths[0], moving, finer.knots, may_wait, hand_over)
+        before = len(solutions)
+        for convex in starts or [None]:
+            only, tried = len(starts) <= 1, len(solutions)
+            ways = hand_over, convex, only, tried, finer
+            coupled = CoupledPhases(group[0], phases, paths, margin_bounds, *ends, *ways)
+            solutions.append(solve_coupled_phases(scene, coupled))
+            if solutions[-1].score >= (True, 1 - options.tolerance):
+                break
+        best = max(solutions, key=lambda found: found.score)
+        if best.score >= (True, GOOD_BOUND_FRACTION) or not any(best is one for one in solutions[before:]):
             break
-    best = max(solutions, key=lambda found: found.score)
     return best._replace(history=[record for found in solutions for record in found.history])
 
 

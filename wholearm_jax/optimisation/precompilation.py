@@ -6,11 +6,12 @@ import optax
 from wholearm_jax.core import BackgroundTask, as_device_array, compile_in_background
 from wholearm_jax.dynamics import placeholder_dynamics
 from wholearm_jax.margin import rest_to_rest
-from wholearm_jax.model import Arrival, Scene, round_up
+from wholearm_jax.model import Arrival, Scene
 from wholearm_jax.optimisation.best_motion import largest_margin
 from wholearm_jax.optimisation.constraints import Limits
 from wholearm_jax.optimisation.coupled_phases import (
     GUESS_TORQUE_FRACTION,
+    schedule_rows,
     solver_method,
     stack_dynamics,
 )
@@ -35,11 +36,6 @@ def precompile_optimise(
     steps = [compile_in_background(_compile_step, n, knots, optimiser) for n in sizes]
     options = with_step_capacity(IntegratorOptions(), knots)
     return guesses, *steps, compile_in_background(precompile_simulation, schedule_rows(scene, knots), options)
-
-
-def schedule_rows(scene: Scene, knots: int) -> int:
-    """Return the rows that the whole plan's schedule may have, with two for a wait before each phase."""
-    return round_up((knots + 2) * len(scene.phases))
 
 
 def _compile_guesses(sizes: tuple[int, ...], rolling: tuple[int, ...], knots: int) -> None:
