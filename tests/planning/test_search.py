@@ -114,6 +114,24 @@ def test_an_object_is_tumbled(name, degrees, regrasp_cost, nodes):
     assert float(traced[-1].end[2] - found.start[2]) == pytest.approx(np.radians(degrees), abs=np.radians(1))
 
 
+def test_a_part_that_can_be_tipped_from_a_small_part_of_a_slide_only_is():
+    """One of the exhaustive search's parts (`exhaustive_planning.py`): thirds of paths alone found nothing."""
+    data = part_data()
+    data["phase"] = [data["phase"][0] | {"contacts": ["palm:v0", "palm:v1", "finger1:v1", "finger2:v2"]}]
+    vertices = [[0.036, -0.0159], [0.0235, 0.0313], [-0.0322, 0.0167], [-0.0261, -0.0247], [0.0147, -0.0332]]
+    data["object"] = {"vertices": vertices, "mass": 0.19, "friction": 0.07}
+    for finger, joint in (("finger1", 0.055), ("finger2", -0.055)):
+        data["hand"][finger] |= {"joint": [joint, 0.0], "length": 0.09}
+    part = wa.parse(data)
+    z = resting_configuration(part.object, part.hand, 1, 0.01)
+    part = eqx.tree_at(lambda s: (s.start, s.phases), part, (jnp.asarray(z), ()))
+    found = wa.plan(part, by={"phi": np.radians(-15)}, count=1, max_nodes=120)
+    assert found.plans[0].bound > 0.08
+    assert any(step.delay > 0 for step in found.plans[0].steps)
+    traced = wa.trace(found.plans[0].scene)
+    assert float(traced[-1].end[2] - z[2]) == pytest.approx(np.radians(-15), abs=np.radians(1))
+
+
 def test_what_has_been_found_when_the_search_ends_is_judged(part):
     """The twelfth configuration's moves reach the goal; two more would be expanded before it had its turn."""
     found = wa.plan(part, by={"phi": -0.1}, count=1, max_nodes=12)

@@ -1,11 +1,12 @@
 r"""Search from a configuration to a goal, over the moves between contact formations.
 
 Nodes are configurations; moves lead from one to the next (`moves_from`). A move may be left at its path's end, where a
-coordinate of the goal has its value, or at a few places between, from where others may begin. The search is best-first,
-by the number of phases and an estimate of those still needed, and drops moves whose margin is below the floor. Two
-orders take turns: by their sum, for plans of up to `SHORT_PLAN` phases, and with more weight on the estimate, which
-goes for a plan of any length. A plan that is found is traced anew, at full resolution, and judged by its certificate:
-the least upper bound of its phases.
+coordinate of the goal has its value, or at places between, from where others may begin: at its thirds at once, at finer
+fractions later, as if they took a phase or two more (an object may be tipped from a small part of a slide only). The
+search is best-first, by the number of phases and an estimate of those still needed, and drops moves whose margin is
+below the floor. Two orders take turns: by their sum, for plans of up to `SHORT_PLAN` phases, and with more weight on
+the estimate, which goes for a plan of any length. A plan that is found is traced anew, at full resolution, and judged
+by its certificate: the least upper bound of its phases.
 Once there are as many plans as wanted, the floor rises to the least certificate among them, so that from then on only
 better ones count; the search ends when it has gone on as long again without finding one.
 """
@@ -14,7 +15,7 @@ import heapq
 import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
@@ -37,7 +38,11 @@ from wholearm_jax.planning.plans import (
 from wholearm_jax.planning.regrasps import regrasp_stops, separate_regrasps
 from wholearm_jax.planning.successors import touching_contacts
 
-STOPS = (1 / 3, 2 / 3)  # fractions of a path at which other moves may begin
+STOPS = {  # fractions of a path at which other moves may begin, and by how many phases later they are tried
+    **dict.fromkeys((1 / 3, 2 / 3), 0.0),
+    **dict.fromkeys((1 / 6, 1 / 2, 5 / 6), 1.0),
+    **dict.fromkeys((1 / 12, 1 / 4, 5 / 12, 7 / 12, 3 / 4, 11 / 12), 2.0),
+}
 MERGE_TOL = 1e-5  # configurations closer than this, in object radii and radians, are one node
 TYPICAL_SHIFT, TYPICAL_TURN = 0.5, 0.5  # of one move [object radii, rad], for the estimate of phases to come
 SHORT_PLAN = 5  # phases
@@ -246,10 +251,11 @@ def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tup
     if distance < search.nearest[0] - 1e-9:
         search.nearest = (distance, steps)
     entry, (short, long) = (next(search.order), z, steps, touching), search.queues
+    spent, to_go = _cost(search, steps), distance + sum(step.delay for step in steps)
     if len(steps) < min(SHORT_PLAN, search.max_phases) or arrived:
-        heapq.heappush(short, (_cost(search, steps) + distance, *entry))
+        heapq.heappush(short, (spent + to_go, *entry))
     if search.max_phases > SHORT_PLAN and (len(steps) < search.max_phases or arrived):
-        heapq.heappush(long, (_cost(search, steps) + ESTIMATE_WEIGHT * distance, *entry))
+        heapq.heappush(long, (spent + ESTIMATE_WEIGHT * to_go, *entry))
 
 
 def _cost(search: _Search, steps: tuple[Step, ...]) -> float:
@@ -316,9 +322,10 @@ def _stops(search: _Search, move: Move) -> Iterator[tuple[Step, bool]]:
         yield from _crossings(move, lowest, name, value)
     displacement = np.abs(move.places[last] - move.places[0]) / np.array([search.radius, search.radius, 1, 1, 1])
     name = COORDINATES[int(np.argmax(displacement))]
-    for fraction in STOPS:
+    for fraction, delay in STOPS.items():
         value = float(move.places[round(fraction * last)][COORDINATES.index(name)])
-        yield from itertools.islice(_crossings(move, lowest, name, value), 1)
+        for step, is_end in itertools.islice(_crossings(move, lowest, name, value), 1):
+            yield replace(step, delay=delay), is_end
 
 
 def _crossings(move: Move, lowest: np.ndarray, name: str, value: float) -> Iterator[tuple[Step, bool]]:
