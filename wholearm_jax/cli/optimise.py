@@ -30,7 +30,7 @@ def optimise(
     out: OutputFolder = None,
     set_: Changes = None,
     knots: Annotated[
-        int | None, typer.Option(min=3, help="Torque knots a phase (51, and up to 201 where those cost margin).")
+        int | None, typer.Option(min=3, help="Torque knots a phase (51, and 201 where those cost margin).")
     ] = None,
     steps: Annotated[int, typer.Option(min=1, help="Most steps of descent from each start.")] = 160,
     rate_limit: Annotated[float | None, typer.Option(min=1e-9, help="Largest torque rate [N m/s].")] = None,

@@ -8,7 +8,7 @@ Derivation: section 9 of `docs/derivation.md`.
 """
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -61,7 +61,7 @@ class OptimiseOptions:
     """Arguments of `optimise`."""
 
     knots: int  # of each phase, and
-    most_knots: int  # as many as there may be where fewer cost margin
+    most_knots: int  # of one in which so few cost margin
     schedule_rows: int  # of the whole plan's schedule: plans with equal rows share programs
     steps: int
     rate_limit: float | None
@@ -71,12 +71,10 @@ class OptimiseOptions:
     tolerance: float
     callback: Callable[[IterationRecord], None] | None
 
-    def refinements(self, scene: Scene) -> Iterator["OptimiseOptions"]:
-        """Yield the same options with as many knots, and with half as long intervals as long as there may be such."""
-        knots = self.knots
-        while knots <= self.most_knots:
-            yield replace(self, knots=knots, schedule_rows=schedule_rows(scene, knots))
-            knots = 2 * knots - 1
+    def refinements(self) -> tuple["OptimiseOptions", ...]:
+        """Return the options of a single phase: these, and with most knots where those are more."""
+        finer = replace(self, knots=self.most_knots, schedule_rows=round_up(self.most_knots + 2))
+        return (self, finer) if self.most_knots > self.knots else (self,)
 
 
 @dataclass(frozen=True)

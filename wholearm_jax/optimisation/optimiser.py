@@ -139,8 +139,8 @@ def optimise(
 
     Each phase must arrive at its planned end in time: at speed where the next phase continues the motion, otherwise at
     rest, also where the plan allows any speed. Torques are linear between evenly spaced knots and stay within the
-    scene's limits. There are 51 knots a phase, and up to 201 where a phase between rests stays more than 1 % below its
-    bound with fewer. A phase that holds the object keeps its duration and gets the best torque of its statics. Where
+    scene's limits. There are 51 knots a phase, and 201 where a phase between rests stays more than 1 % below its bound
+    with 51. A phase that holds the object keeps its duration and gets the best torque of its statics. Where
     no torque can hold a contact formation, nothing is searched and the status says so.
 
     Args:
@@ -190,7 +190,13 @@ def optimise(
     if any(int(path.dynamics.status) == Status.OK for path in traced):
         wait_for(*compiled)
     if margin is not None:
-        again = {"knots": knots, "steps": steps, "rate_limit": rate_limit, "passing": passing, "optimiser": optimiser}
+        again = {
+            "knots": first_knots,
+            "steps": steps,
+            "rate_limit": rate_limit,
+            "passing": passing,
+            "optimiser": optimiser,
+        }
         solve = partial(optimise, **again, tolerance=tolerance, callback=callback, traced=traced)
         return shortest_plan(solve, scene, margin, traced)
 
@@ -283,7 +289,7 @@ def _solve_group(
     may_wait = options.rate_limit is None and options.durations is None
     moving = float(phases[0].duration) - (ends[0].dwell_time if ends[0] is not None else 0.0)
     solutions: list[GroupSolution] = []
-    for finer in options.refinements(scene):
+    for finer in options.refinements():
         starts = convex_starts(scene, phases[0], paths[0], moving, finer.knots, may_wait, hand_over)
         before = len(solutions)
         for convex in starts or [None]:
