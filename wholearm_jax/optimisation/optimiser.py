@@ -291,7 +291,6 @@ def _solve_group(
     solutions: list[GroupSolution] = []
     for finer in options.refinements():
         starts = convex_starts(scene, phases[0], paths[0], moving, finer.knots, may_wait, hand_over)
-        before = len(solutions)
         for convex in starts or [None]:
             only, tried = len(starts) <= 1, len(solutions)
             ways = hand_over, convex, only, tried, finer
@@ -300,7 +299,7 @@ def _solve_group(
             if solutions[-1].score >= (True, 1 - options.tolerance):
                 break
         best = max(solutions, key=lambda found: found.score)
-        if best.score >= (True, GOOD_BOUND_FRACTION) or not any(best is one for one in solutions[before:]):
+        if best.score >= (True, GOOD_BOUND_FRACTION):
             break
     return best._replace(history=[record for found in solutions for record in found.history])
 
