@@ -79,7 +79,7 @@ def test_a_start_that_leads_to_a_known_end_is_not_followed_to_it():
     scene = layered("heptagon")
     for k in range(2):
         scene = eqx.tree_at(lambda s, k=k: s.phases[k].duration, scene, jnp.asarray(0.15))
-    found = wa.optimise(scene)
+    found = wa.optimise(scene, knots=51)
     assert found.result.status is wa.Status.OK
     below = [row for row, share in enumerate(found.bound_fraction) if share < 0.99]
     assert below
