@@ -34,12 +34,14 @@ def read_controller(path: str | Path) -> Controller:
 
     >>> wa.read_controller("no_such_file.json")
     Traceback (most recent call last):
-    wholearm_jax.core.errors.BadInput: no_such_file.json: cannot be read as JSON: No such file or directory
+    wholearm_jax.core.errors.BadInput: no_such_file.json: No such file or directory
     """
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise BadInput(f"{path}: cannot be read as JSON: {getattr(error, 'strerror', None) or error}") from None
+    except OSError as error:
+        raise BadInput(f"{path}: {error.strerror or error}") from None
+    except (ValueError, RecursionError) as error:
+        raise BadInput(f"{path}: cannot be read as JSON: {error}") from None
     if not isinstance(content, dict) or content.get("version") != VERSION:
         raise BadInput(f"{path}: version: not a controller of version {VERSION}")
     rows = content.get("phases")
