@@ -63,17 +63,15 @@ def optimise(
     loaded = load_scene(scene, set_)
     folder = make_output_folder(out)
     uncertain = _uncertain_set(loaded, robust, seed) if feedback else {}
+    from wholearm_jax.optimisation import DEFAULT_KNOTS, MIN_TRANSITION_SPEED
+
     if robust and not feedback:
         others = (("rate-limit", rate_limit), ("passing", passing), ("margin", margin))
         unknown = [name for name, value in others if value is not None]
         if unknown:
             raise BadInput(f"--robust: knows no --{unknown[0]}")
         ensemble = parse_ensemble(loaded, robust, seed)
-        from wholearm_jax.optimisation import DEFAULT_KNOTS
-
         _optimise_ensemble(ensemble, folder, samples or 64, knots or DEFAULT_KNOTS, steps, arrival, report, as_json)
-    from wholearm_jax.optimisation import MIN_TRANSITION_SPEED
-
     passing = MIN_TRANSITION_SPEED if passing is None else passing
     options = {"knots": knots, "steps": steps, "rate_limit": rate_limit, "passing": passing, "margin": margin}
     begun = time.perf_counter()
