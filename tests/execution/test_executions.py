@@ -99,7 +99,7 @@ def test_a_tip_touches_the_edge_that_it_is_least_deep_in(predictions):
         tip = start[k] + rng.choice([share, 1 - share]) * vector[k] + depth * 1j * direction[k]
         theta = np.angle(1j * direction[k])
         lies = edges.joint[finger] + edges.tip[finger] * np.exp(1j * theta) - tip
-        touches = _tip_touches(edges, np.array([lies.real, lies.imag, 0.0, theta, theta]))[finger]
+        touches = _tip_touches(edges, lies, np.exp(1j * np.array([0.0, theta, theta])))[finger]
         place, along_k = (tip - start) / vector, direction / direction[k]
         others = [j for j, vertex in (((k - 1) % count, k - 1), ((k + 1) % count, k)) if edges.convex[vertex]]
         less_deep = [

@@ -147,23 +147,22 @@ def choose_pairs(
 
     Faces are chosen anew where a dot is beyond the other finger's end, or `everywhere`.
     """
-    turn = np.exp(1j * qpos[2:])  # of the object, and of each finger
+    place, turn = complex(*qpos[:2]), np.exp(1j * qpos[2:])  # of the object; of it and each finger
     vertices = acting.vertices
-    corner = complex(*qpos[:2]) + vertices.vertex * turn[0]
+    corner = place + vertices.vertex * turn[0]
     along = ((corner - vertices.joint) * turn[1:].conj()[vertices.finger]).real
     _act(model, acting, vertices.row, along <= vertices.length)
-    _act(model, acting, acting.edges.row, _tip_touches(acting.edges, qpos))
+    _act(model, acting, acting.edges.row, _tip_touches(acting.edges, place, turn))
     if len(acting.faces.row):
         _choose_faces(model, acting, turn[1:], everywhere)
 
 
-def _tip_touches(edges: EdgePairs, qpos: Float[np.ndarray, "5"]) -> Bool[np.ndarray, "fingers edges"]:
-    """Say which edges the fingertips touch if they come that near."""
-    turn = np.exp(1j * qpos[2:])
+def _tip_touches(edges: EdgePairs, place: complex, turn: Complex[np.ndarray, "3"]) -> Bool[np.ndarray, "fingers edges"]:
+    """Say which edges the fingertips touch if they come that near, for an object at `place` and the bodies' turns."""
     back, fingers = turn[0].conj(), turn[1:]
-    tip = (edges.joint + edges.tip * fingers - complex(*qpos[:2])) * back
-    place = np.multiply.outer(tip, edges.toward) - edges.origin
-    along, inside = place.real, place.imag
+    tip = (edges.joint + edges.tip * fingers - place) * back
+    from_start = np.multiply.outer(tip, edges.toward) - edges.origin
+    along, inside = from_start.real, from_start.imag
     from_outside = np.multiply.outer(fingers * back, edges.toward).imag >= 0
     touches = from_outside & (along >= 0) & (along <= edges.length) & (inside < edges.depth)
     # At a convex vertex that the tip has sunk in from both sides, the less deep one.

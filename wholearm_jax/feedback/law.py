@@ -64,11 +64,11 @@ def step(
     most = controller.push / max(abs(gain[0]), abs(gain[1]))
     ahead = min(most, phase.press) if s_ref > phase.length - phase.reach else most
     damping = 2 * w * (v_ref - state.v)
-    wanted = w**2 * (s_ref - state.s) + damping + state.i
-    a = min(max(wanted, -most), ahead)
+    uncut = w**2 * (s_ref - state.s) + damping + state.i
+    a = min(max(uncut, -most), ahead)
     i = state.i + h * controller.integral * (a - damping - state.i)
     torque = np.clip(torque + gain * a, -controller.torque_limit, controller.torque_limit)
-    return state._replace(time=time, i=i, pressed=bool(wanted >= ahead)), torque
+    return state._replace(time=time, i=i, pressed=bool(uncut >= ahead)), torque
 
 
 def project_on_path(phase: PhaseLaw, angles, s: float) -> float:

@@ -82,6 +82,7 @@ def explain(
     refused = [k for k in searched if _no_torque_holds(result.phases[k], float(values[k].value))]
     open_ones = [k for k in searched if k not in refused and result.phases[k].arrive is not Arrival.HOLD]
     fastest = shortest_motions(result.scene, 0.0, traced=traced) if open_ones else (None,) * len(traced)
+    shorter = {} if search is None else _shorter_durations(result.scene, traced, open_ones)
     for k, shortest in too_short.items():
         detail, remedy = _explain_motion(k, phases[k], shortest, search)
         phases[k] = replace(phases[k], status=Status.TOO_SHORT, contact=None, slips=False, detail=detail, remedy=remedy)
@@ -92,8 +93,7 @@ def explain(
         elif motion is not None:
             at_speed = [j for j in (k - 1, k) if j >= 0 and phases[j].arrive is Arrival.MOVING]
             stop = phases[at_speed[0]].name if at_speed else None
-            shorter = _shorter_durations(result.scene, traced, k) if at_speed and search is not None else {}
-            detail, remedy = _explain_motion(k, phases[k], motion.duration, search, stop, shorter)
+            detail, remedy = _explain_motion(k, phases[k], motion.duration, search, stop, shorter.get(k, {}))
             phases[k] = replace(phases[k], detail=detail or phases[k].detail, remedy=remedy)
     return replace(result, phases=tuple(phases))
 
@@ -178,17 +178,25 @@ def _explain_motion(
     )
 
 
-def _shorter_durations(scene: Scene, traced: tuple[TracedPhase, ...], number: int) -> dict[int, float]:
-    """Return shorter durations [s] of the phases that phase `number` is coupled with; none where they are not long."""
-    group = next(group for group in group_phases(scene) if number in group)
-    best = [motion for k, motion in enumerate(convex_bounds(scene, any_duration=True, traced=traced)) if k in group]
-    level = ENOUGH_MARGIN * min((motion.margin for motion in best if motion is not None), default=-math.inf)
-    if not level > 0:
-        return {}
-    fastest = shortest_motions(scene, level, traced=traced)
-    durations = {k: float(scene.phases[k].duration) for k in group}
-    share = max(AMPLE_TIME * motion.duration / durations[k] for k in group if (motion := fastest[k]) is not None)
-    return {k: round_up_digits(share * duration) for k, duration in durations.items()} if share < LONG_SHARE else {}
+def _shorter_durations(
+    scene: Scene, traced: tuple[TracedPhase, ...], failed: Sequence[int]
+) -> dict[int, dict[int, float]]:
+    """Return shorter durations [s] of the phases that a failed one is coupled with, where theirs are long."""
+    groups = [group for group in group_phases(scene) if len(group) > 1 and not set(group).isdisjoint(failed)]
+    best = convex_bounds(scene, any_duration=True, traced=traced) if groups else ()
+    found = {}
+    for group in groups:
+        margins = [motion.margin for k in group if (motion := best[k]) is not None]
+        level = ENOUGH_MARGIN * min(margins, default=-math.inf)
+        if not level > 0:
+            continue
+        fastest = shortest_motions(scene, level, traced=traced)
+        durations = {k: float(scene.phases[k].duration) for k in group}
+        share = max(AMPLE_TIME * motion.duration / durations[k] for k in group if (motion := fastest[k]) is not None)
+        if share < LONG_SHARE:
+            shorter = {k: round_up_digits(share * duration) for k, duration in durations.items()}
+            found |= {k: shorter for k in group}
+    return found
 
 
 def _first_half(phase: PhaseResult) -> str:

@@ -73,7 +73,7 @@ class OptimiseOptions:
 
     def refinements(self) -> tuple["OptimiseOptions", ...]:
         """Return the options of a single phase: these, and with most knots where those are more."""
-        finer = replace(self, knots=self.most_knots, schedule_rows=round_up(self.most_knots + 2))
+        finer = replace(self, knots=self.most_knots, schedule_rows=schedule_rows(1, self.most_knots))
         return (self, finer) if self.most_knots > self.knots else (self,)
 
 
@@ -133,9 +133,9 @@ class CoupledPhases:
         return np.array([float(bound.value) for bound in self.margin_bounds])
 
 
-def schedule_rows(scene: Scene, knots: int) -> int:
-    """Return the rows that the whole plan's schedule may have, with two for a wait before each phase."""
-    return round_up((knots + 2) * len(scene.phases))
+def schedule_rows(phases: int, knots: int) -> int:
+    """Return the rows that the schedule of so many phases may have, with two for a wait before each."""
+    return round_up((knots + 2) * phases)
 
 
 def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> GroupSolution:

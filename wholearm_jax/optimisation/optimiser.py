@@ -170,7 +170,7 @@ def optimise(
     ('ok', ['1.00', '1.00'])
     """
     require_x64(scene)
-    first_knots, most_knots = (DEFAULT_KNOTS, MOST_KNOTS) if knots is None else (knots, knots)
+    first_knots = DEFAULT_KNOTS if knots is None else knots
     require_knots(first_knots)
     rate_limit = None if rate_limit == np.inf else rate_limit
     require_positive(steps=steps, tolerance=tolerance, rate_limit=np.inf if rate_limit is None else rate_limit)
@@ -217,10 +217,10 @@ def optimise(
         too_short_phases(longest, pointwise, motions, traced),
     )
 
-    rows, heard = schedule_rows(scene, first_knots), callback and _one_at_a_time(callback)
-    most_knots = first_knots if rate_limit is not None or optimiser is not None else most_knots
-    count = first_knots, most_knots, rows
-    options = OptimiseOptions(*count, steps, rate_limit, durations, passing, optimiser, tolerance, heard)
+    refines = knots is None and rate_limit is None and optimiser is None
+    counts = first_knots, MOST_KNOTS if refines else first_knots, schedule_rows(len(scene.phases), first_knots)
+    heard = callback and _one_at_a_time(callback)
+    options = OptimiseOptions(*counts, steps, rate_limit, durations, passing, optimiser, tolerance, heard)
     results = []
     for max_dwell in MAX_DWELLS if rate_limit is not None else MAX_DWELLS[:1]:
         results.append(_solve_plan(scene, traced, limits, options, max_dwell))
@@ -281,9 +281,9 @@ def _solve_group(
         return GroupSolution(schedules, f"phase '{scene.phases[short[0]].name}' is too short for any motion", [])
     margin_bounds: list[MarginBound] = [limits.bounds[k] for k in group]
     hand_over = limits.hand_overs[group[0]]
+    coupled = partial(CoupledPhases, group[0], phases, paths, margin_bounds, *ends, hand_over)
     if len(group) > 1 or int(paths[0].dynamics.status) != Status.OK or not float(margin_bounds[0].value) > 0:
-        coupled = CoupledPhases(group[0], phases, paths, margin_bounds, *ends, hand_over, None, True, 0, options)
-        return solve_coupled_phases(scene, coupled)
+        return solve_coupled_phases(scene, coupled(None, True, 0, options))
 
     # A single phase: from its convex optimum, with more knots where they cost margin.
     may_wait = options.rate_limit is None and options.durations is None
@@ -292,10 +292,8 @@ def _solve_group(
     for finer in options.refinements():
         starts = convex_starts(scene, phases[0], paths[0], moving, finer.knots, may_wait, hand_over)
         for convex in starts or [None]:
-            only, tried = len(starts) <= 1, len(solutions)
-            ways = hand_over, convex, only, tried, finer
-            coupled = CoupledPhases(group[0], phases, paths, margin_bounds, *ends, *ways)
-            solutions.append(solve_coupled_phases(scene, coupled))
+            problem = coupled(convex, len(starts) <= 1, len(solutions), finer)
+            solutions.append(solve_coupled_phases(scene, problem))
             if solutions[-1].score >= (True, 1 - options.tolerance):
                 break
         best = max(solutions, key=lambda found: found.score)

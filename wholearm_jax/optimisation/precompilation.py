@@ -35,7 +35,11 @@ def precompile_optimise(
     guesses = compile_in_background(_compile_guesses, tuple(sizes), tuple(rolling), knots)
     steps = [compile_in_background(_compile_step, n, knots, optimiser) for n in sizes]
     options = with_step_capacity(IntegratorOptions(), knots)
-    return guesses, *steps, compile_in_background(precompile_simulation, schedule_rows(scene, knots), options)
+    return (
+        guesses,
+        *steps,
+        compile_in_background(precompile_simulation, schedule_rows(len(scene.phases), knots), options),
+    )
 
 
 def _compile_guesses(sizes: tuple[int, ...], rolling: tuple[int, ...], knots: int) -> None:

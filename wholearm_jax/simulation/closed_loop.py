@@ -80,8 +80,8 @@ def _act(loop: PhaseLoop, row, phase_time, memory):
     most = loop.push / jnp.abs(gain).max()
     ahead = jnp.where(take_row(loop.presses, row), jnp.minimum(most, loop.press), most)
     damping = 2 * loop.stiffness * (now[1] - v)
-    wanted = loop.stiffness**2 * (now[0] - s) + damping + i
-    acceleration = jnp.minimum(jnp.maximum(wanted, -most), ahead)
+    uncut = loop.stiffness**2 * (now[0] - s) + damping + i
+    acceleration = jnp.minimum(jnp.maximum(uncut, -most), ahead)
     return now[2:], gain, acceleration, loop.integral * (acceleration - damping - i)
 
 
