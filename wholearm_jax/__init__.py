@@ -10,7 +10,7 @@ import warnings
 from typing import TYPE_CHECKING
 
 import wholearm_jax.cli.interruption  # noqa: F401, first: a command may be interrupted while the rest is imported
-from wholearm_jax.core import Status, configure
+from wholearm_jax.core import Status, configure, keep_compiled
 from wholearm_jax.ensembles import check
 from wholearm_jax.feedback import Controller, feedback
 from wholearm_jax.files import (
@@ -48,6 +48,7 @@ __all__ = [
     "configure",
     "convex_bounds",
     "feedback",
+    "keep_compiled",
     "load",
     "margin",
     "optimise",

@@ -59,3 +59,29 @@ def test_other_warnings_and_other_folders_are_left_alone(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["jit_a-1"]
     assert executable_cache.discard_unreadable_entry(message)
     assert os.listdir(tmp_path) == []
+
+
+ASKED = """
+import jax
+import wholearm_jax as wa
+wa.keep_compiled()
+print(jax.config.values["jax_compilation_cache_dir"])
+"""
+
+
+@pytest.mark.parametrize(
+    ("settings", "folder"),
+    [
+        ({"XDG_CACHE_HOME": "HERE"}, "HERE/wholearm_jax"),
+        ({"XDG_CACHE_HOME": "", "HOME": "HERE"}, "HERE/.cache/wholearm_jax"),
+        ({"XDG_CACHE_HOME": "HERE", "JAX_COMPILATION_CACHE_DIR": "HERE/other"}, "HERE/other"),
+        ({"XDG_CACHE_HOME": "HERE", "JAX_ENABLE_COMPILATION_CACHE": "false"}, "None"),
+    ],
+)
+def test_without_a_folder_it_is_the_command_lines_unless_jax_has_its_own(settings, folder, tmp_path):
+    others = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    own = {name: value.replace("HERE", str(tmp_path)) for name, value in settings.items()}
+    done = subprocess.run(
+        [sys.executable, "-c", ASKED], capture_output=True, text=True, check=True, env=others | own, cwd=tmp_path
+    )
+    assert done.stdout.strip() == folder.replace("HERE", str(tmp_path))

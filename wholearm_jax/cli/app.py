@@ -9,10 +9,8 @@ import os
 import sys
 import warnings
 from importlib import metadata
-from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import typer
 
 from wholearm_jax.cli.arguments import BadInput, note
@@ -64,7 +62,7 @@ def main() -> None:
     gc.set_threshold(100_000, 20, 20)
     if sys.argv[1:2] != ["check"]:  # `check` configures itself by the number of its scenes
         configure()
-    _keep_compiled()
+    keep_compiled()
     _handle_warnings()
     try:
         sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False) or 0)
@@ -91,14 +89,6 @@ def _handle_warnings() -> None:
             show(message, category, *others)
 
     warnings.showwarning = show_note
-
-
-def _keep_compiled() -> None:
-    """Keep compiled programs in the user's cache folder, unless JAX's own settings name another or none."""
-    if jax.config.values["jax_compilation_cache_dir"] is not None or "JAX_ENABLE_COMPILATION_CACHE" in os.environ:
-        return
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    keep_compiled(Path(home, "wholearm_jax"))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ JAX warns of an entry that it cannot read, compiles the program, and leaves the 
 warn and compile again.
 """
 
+import os
 import re
 import zlib
 from pathlib import Path
@@ -18,9 +19,23 @@ _UNREADABLE_ENTRY = re.compile(r"Error reading persistent compilation cache entr
 _own_folder: Path | None = None
 
 
-def keep_compiled(folder: Path) -> None:
-    """Keep compiled programs, and traced ones, in a folder, from this process and for later ones."""
+def keep_compiled(folder: Path | None = None) -> None:
+    """Keep compiled programs, and traced ones, in a folder, from this process and for later ones.
+
+    Call it before JAX computes anything, next to `configure`: a later script or notebook then neither traces nor
+    compiles what it shares with earlier ones.
+
+    Args:
+        folder: Where to. None: the folder of the command line, `~/.cache/wholearm_jax` (or below `XDG_CACHE_HOME`);
+            where JAX's own settings name another folder for compiled programs, or none, these hold and nothing is done.
+
+    >>> wa.keep_compiled()
+    """
     global _own_folder
+    if folder is None:
+        if jax.config.values["jax_compilation_cache_dir"] is not None or "JAX_ENABLE_COMPILATION_CACHE" in os.environ:
+            return
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "wholearm_jax")
     _own_folder = folder
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_CACHED_COMPILE_TIME)
