@@ -1,5 +1,6 @@
 """Every test computes in 64 bits, compiles as the command line does, and leaves room for those that follow."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from wholearm_jax.core.config import configure
 MAPPED = 30_000  # half of the memory areas that Linux grants a process by default
 
 configure()
+gc.set_threshold(100_000, 20, 20)
 
 
 def pytest_configure(config):

@@ -16,6 +16,7 @@ SMALLER = {  # what the tests put in the place of sizes that a notebook's first 
     "5_tolerance": {"PARTS": "40", "SPREAD": "4"},
     "6_execution": {"STEPS": "[1.6e-3, 8e-4]", "EXECUTIONS": "2"},
     "7_real_hand": {"EXECUTIONS": "1", "PUSHES": "[-0.1, 0.1]", "PUSHED_AT": "[0.4]", "STARTS": "[2e-3]"},
+    "8_drawing": {"LENGTHS": "(0.1, 0.1)", "JOINTS": "(0.045, 0.045)", "STEP": "5e-4"},
 }
 
 

@@ -52,7 +52,12 @@ def predictions():
 
 @pytest.fixture(scope="module")
 def executions(predictions):
-    return {name: execute(prediction, timestep=2e-4) for name, prediction in predictions.items()}
+    return {name: execute(prediction, timestep=4e-4) for name, prediction in predictions.items()}
+
+
+@pytest.fixture(scope="module")
+def fine_executions(predictions):
+    return {name: execute(prediction, timestep=1e-4) for name, prediction in predictions.items()}
 
 
 # --- the model: geometry and mechanics --------------------------------------------------------------------------------
@@ -246,7 +251,7 @@ def test_contact_forces_and_weight_change_the_momentum(name, executions):
 def test_ends_where_predicted(name, executions):
     done = executions[name]
     assert done.ending is ExecutionOutcome.OK
-    assert done.timestep == pytest.approx(2e-4, rel=1e-12)
+    assert done.timestep == pytest.approx(4e-4, rel=1e-12)
     assert done.position_error < 3e-5
     assert abs(done.angle_error) < 1e-4
 
@@ -266,9 +271,9 @@ def test_forces_are_those_predicted(name, executions):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_least_force_is_that_predicted(name, predictions):
+def test_the_least_force_is_that_predicted(name, fine_executions):
     """Of all contacts of each phase, whose first and last twentieth are left out, to 1 % at a step of 0.1 ms."""
-    done = execute(predictions[name], timestep=1e-4)
+    done = fine_executions[name]
     for phase in done.prediction.phases:
         inside = np.abs(done.expected.time - phase.start - phase.duration / 2) < 0.45 * phase.duration
         rows = [done.names.index(contact) for contact in phase.contacts]
@@ -287,16 +292,15 @@ def test_contacts_change_when_predicted(name, new, executions):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_error_shrinks_with_the_time_step(name, predictions, executions):
+def test_error_shrinks_with_the_time_step(name, executions, fine_executions):
     """Contacts and friction harden with the time step: the worst deviation is of first order."""
-    fine = execute(predictions[name], timestep=5e-5)
 
     def worst(done):
         times, z = done.expected.time, done.course.z
         off = [np.interp(times, done.course.time, z[:, k]) - done.expected.z[:, k] for k in range(2)]
         return np.hypot(*off).max()
 
-    assert worst(fine) < 0.3 * worst(executions[name])
+    assert worst(fine_executions[name]) < 0.3 * worst(executions[name])
 
 
 def test_a_plan_predicted_to_fail_fails(predictions):
@@ -320,7 +324,7 @@ def test_a_plan_of_one_step():
 def test_perturbed_executions_repeat_with_the_seed(predictions):
     few = {"timestep": 5e-4, "workers": 1}
     first, again, other = (
-        run_trials(predictions["hexagon"], 3, Amounts(0.1, 0.05, 5e-4, 5e-4), seed=seed, **few) for seed in (1, 1, 2)
+        run_trials(predictions["hexagon"], 2, Amounts(0.1, 0.05, 5e-4, 5e-4), seed=seed, **few) for seed in (1, 1, 2)
     )
     assert first.message == again.message
     for one, two, three in zip(first.runs, again.runs, other.runs, strict=True):
@@ -328,7 +332,7 @@ def test_perturbed_executions_repeat_with_the_seed(predictions):
         assert np.abs(one.end - three.end).max() > 1e-6
         assert np.all(np.abs(one.friction - 1) <= 0.1)
         assert abs(one.mass - 1) <= 0.05
-    assert len({run.mass for run in first.runs}) == 3
+    assert len({run.mass for run in first.runs}) == 2
 
 
 def test_unperturbed_copies_end_as_the_execution_does(predictions):
@@ -340,7 +344,7 @@ def test_unperturbed_copies_end_as_the_execution_does(predictions):
 
 def test_small_changes_of_mass_do_no_harm(predictions):
     told = []
-    settings = {"tolerance": Tolerance(1e-3, 0.02), "callback": told.append}
+    settings = {"tolerance": Tolerance(1e-3, 0.02), "callback": told.append, "timestep": 5e-4}
     many = run_trials(predictions["heptagon"], 6, Amounts(mass=0.02), **settings)
     assert many.successes == 6
     assert tuple(told) == many.runs

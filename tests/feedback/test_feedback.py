@@ -16,6 +16,8 @@ from wholearm_jax.execution import Amounts, ExecutionOutcome, Hardware, execute,
 from wholearm_jax.feedback import HeldSet, PassingImpulse, begin, held_set, law_tables, step
 from wholearm_jax.phases import closed_loop_result
 
+STEP = 5e-4  # of executions [s]
+
 
 @pytest.fixture(scope="module")
 def path(controller, tmp_path_factory):
@@ -85,15 +87,16 @@ def test_friction_that_open_loop_does_not_survive_is_survived(controller, scene)
     """A fifth more friction on all links: the schedule leaves the object short, the law brings it to its end."""
     rougher = eqx.tree_at(lambda s: s.object.friction, scene, 1.2 * scene.object.friction)
     prediction = wa.simulate(rougher, wa.quasistatic(scene))
-    assert execute(prediction).ending is not ExecutionOutcome.OK
-    closed = execute(prediction, controller=controller, hardware=Hardware(), seed=0)
+    assert execute(prediction, timestep=STEP).ending is not ExecutionOutcome.OK
+    closed = execute(prediction, controller=controller, hardware=Hardware(), seed=0, timestep=STEP)
     assert closed.ending is ExecutionOutcome.OK
     assert closed.position_error < 1e-4
 
 
 def test_trials_count_against_each_objects_own_end(controller, scene):
     prediction = wa.simulate(scene, wa.quasistatic(scene))
-    trials = run_trials(prediction, 1, Amounts(friction=0.1, geometry=2e-4), controller=controller, workers=1)
+    amounts = Amounts(friction=0.1, geometry=2e-4)
+    trials = run_trials(prediction, 1, amounts, controller=controller, workers=1, timestep=STEP)
     (run,) = trials.runs
     assert run.own_ending is ExecutionOutcome.OK
     assert run.own_position_error != run.position_error
@@ -103,9 +106,10 @@ def test_trials_count_against_each_objects_own_end(controller, scene):
 def test_the_least_force_under_a_law_is_that_of_the_model(controller, scene):
     """Free bodies, sampled, late and noisy, against the path's equation of motion: within 5 % of the mean force."""
     prediction = wa.simulate(scene, wa.quasistatic(scene))
-    trials = run_trials(prediction, 1, Amounts(friction=0.1), controller=controller, workers=1)
+    trials = run_trials(prediction, 1, Amounts(friction=0.1), controller=controller, workers=1, timestep=STEP)
     (run,) = trials.runs
-    course = execute(wa.simulate(run.scene, wa.quasistatic(scene)), controller=controller, hardware=Hardware())
+    own = wa.simulate(run.scene, wa.quasistatic(scene))
+    course = execute(own, controller=controller, hardware=Hardware(), timestep=STEP)
     mean = np.mean([course.force(name, course.course.time).mean() for name in scene.phases[-1].formation.names])
     model = wa.check([run.scene], controller=controller)
     assert model.status[0] == 0

@@ -25,7 +25,7 @@ def test_a_law_passes_from_phase_to_phase_in_time():
         assert phase.flows
         assert phase.reach > 0
         assert phase.approach == pytest.approx(phase.v_ref[-1])
-    done = execute(optimum.result, controller=law, hardware=Hardware())
+    done = execute(optimum.result, controller=law, hardware=Hardware(), timestep=4e-4)
     assert done.ending is ExecutionOutcome.OK
     assert done.course.time[-1] < 1.2 * float(sum(phase.duration for phase in optimum.scene.phases)) + 0.1
 

@@ -103,5 +103,5 @@ def test_the_margin_covers_parts_of_other_shape(heptagon):
 def test_parts_of_other_shape_arrive_at_their_own_stops(heptagon):
     law = feedback(heptagon.scene, heptagon.torque, friction=0.2, mass=0.1, shape=SHAPE)
     amounts = Amounts(friction=0.2, mass=0.1, geometry=SHAPE, start=1e-3)
-    trials = run_trials(heptagon, 10, amounts, seed=0, timestep=4e-4, controller=law)
-    assert trials.own_successes == 10
+    trials = run_trials(heptagon, 8, amounts, seed=0, timestep=5e-4, controller=law)
+    assert trials.own_successes == 8
