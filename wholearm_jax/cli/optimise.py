@@ -131,11 +131,13 @@ def _design(optimum, uncertain: dict[str, float], as_json: bool):
 
 def _note_impulse(scene, impulse) -> None:
     """Say where an impulse pulls between phases that follow one another without a stop."""
+    from wholearm_jax.phases import MAX_OPENING
+
     if impulse is not None and impulse.share < 0:
         note(
             f"'{scene.phases[impulse.phase].name}': for some objects of the set the impulse at its beginning pulls at"
-            f" {impulse.contact}, {-100 * impulse.share:.2g} % of the largest: the contact opens for an instant,"
-            " which `check` counts as lost"
+            f" {impulse.contact}, {-100 * impulse.share:.2g} % of the largest: the contact opens for an instant, and"
+            f" `check` counts it as lost if by more than {1e6 * MAX_OPENING:.2g} micrometre"
         )
 
 

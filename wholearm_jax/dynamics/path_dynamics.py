@@ -47,6 +47,7 @@ class PathDynamics(eqx.Module):
 
     # transitions and limits
     impact_map: Float[Array, "5 5"]  # from `z_dot` before an impact to (ds/dt, impulses [N s]) after it
+    contact_inertia: Float[Array, "rows rows"]  # impulses for a speed of one gap (column) at the path's start [kg]
     torque_limit: Float[Array, "2"]  # [N m]
     ends_at_obstacle: Bool[Array, ""]  # whether links meet, or a joint's range ends, at the path's end
 
@@ -108,7 +109,12 @@ def placeholder_dynamics(resolution: Resolution, contacts: int = 4) -> PathDynam
     fields |= {"force": np.zeros((panels, nodes, contacts, TERMS)), "friction_ratio": np.zeros((segments, contacts))}
     fields |= {"breakpoints": np.arange(segments + 1.0), "speed_ratio": np.ones(segments), "torque_limit": np.ones(2)}
     fields |= {"tangential": np.zeros(contacts, bool), "rolling_friction": np.zeros(contacts)}
-    fields |= {"impact_map": np.zeros((5, 5)), "first": np.zeros(segments, int), "panels": np.ones(segments, int)}
+    fields |= {
+        "impact_map": np.zeros((5, 5)),
+        "contact_inertia": np.eye(contacts),
+        "first": np.zeros(segments, int),
+        "panels": np.ones(segments, int),
+    }
     fields |= {"ends_at_obstacle": np.asarray(False)}
     arrays = {name: as_device_array(value) for name, value in fields.items()}
     return PathDynamics(count=one, error=zero, condition=zero, status=whole, **arrays)

@@ -34,7 +34,7 @@ def tabulate_path_dynamics(mechanics: ScaledMechanics, path: ContactPath) -> Pat
     Its status is that of the path, or `singular` where friction wedges the object or the equations are too badly
     conditioned.
     """
-    solution, impact_map = _solve_nodes(mechanics, path)
+    solution, impact_map, contact_inertia = _solve_nodes(mechanics, path)
     is_away = mechanics.contacts.is_away
     if is_away is not None:  # what holds a finger that is away is no contact's force: it counts as the first again
         solution = solution._replace(force=_repeat_first(solution.force, is_away, axis=-2))
@@ -69,6 +69,7 @@ def tabulate_path_dynamics(mechanics: ScaledMechanics, path: ContactPath) -> Pat
         tangential=mechanics.contacts.tangential,
         rolling_friction=jnp.where(mechanics.contacts.tangential, mechanics.contacts.friction, 0.0),
         impact_map=impact_map * jnp.append(1.0, jnp.full(4, force))[:, None] / unit,
+        contact_inertia=contact_inertia * force / mechanics.length,
         torque_limit=mechanics.torque_limit,
         ends_at_obstacle=path.end_reason == int(PathEnd.OBSTACLE),
         error=jnp.maximum(geometry_error, dynamics_error),
@@ -82,22 +83,30 @@ def _repeat_first(values, where: Bool[Array, "rows"], axis: int):
     return jnp.where(jnp.expand_dims(where, -1), jnp.take(values, jnp.array([0]), axis=axis), values)
 
 
-def _solve_nodes(mechanics: ScaledMechanics, path: ContactPath) -> tuple[_NodeSolution, Float[Array, "5 5"]]:
-    """Solve the equations of motion at every node (panels, nodes), and compute the impact map of the path's start."""
+def _solve_nodes(
+    mechanics: ScaledMechanics, path: ContactPath
+) -> tuple[_NodeSolution, Float[Array, "5 5"], Float[Array, "4 4"]]:
+    """Solve the equations of motion at every node (panels, nodes).
+
+    Returns:
+        The solution; then, at the path's start, the impact map and the contact-space inertia.
+    """
     shape = path.nodes.shape[:2]
     z = jnp.concatenate([path.nodes.reshape(-1, 5), path.start[None]])
     segment = jnp.append(jnp.repeat(path.segment_of_panel, shape[1]), 0)
     chart, slip_sign, joint_sign = path.chart[segment], path.slip_sign[segment], path.joint_sign[segment]
-    inverse, solutions = jax.vmap(lambda *node: _solve_node(mechanics, *node))(z, chart, slip_sign, joint_sign)
+    impact, back, solutions = jax.vmap(lambda *node: _solve_node(mechanics, *node))(z, chart, slip_sign, joint_sign)
     solutions = jax.tree.map(lambda a: a[:-1].reshape(*shape, *a.shape[1:]), solutions)
-    return solutions, inverse[-1]
+    # Velocities `back` move one gap each; momentum that they take or give is that of the impulses.
+    return solutions, impact[-1], -fused_matmul(impact[-1, 1:], back[-1])
 
 
 def _solve_node(mechanics: ScaledMechanics, z, u, slip_sign, joint_sign):
     """Solve the equations of motion at `z`, in the chart with direction `u`.
 
     Returns:
-        The map from `z_dot` before an impact to speed and impulses after it (5, 5), and the solution.
+        The map from `z_dot` before an impact to speed and impulses after it (5, 5), velocities that move one gap each
+        (5, 4), and the solution.
     """
     local = path_derivatives(mechanics, z, u)
     x, curvature = local.x, local.curvature
@@ -114,6 +123,5 @@ def _solve_node(mechanics: ScaledMechanics, z, u, slip_sign, joint_sign):
     reverse = fused_matmul(reverse_right[:, jnp.array([0, 3, 4])].T, normal)
     reverse_acceleration = reverse * (normal @ reverse_matrix[:, 0]) / frictionless**2
     condition = jnp.abs(matrix).sum(0).max() * jnp.abs(inverse).sum(0).max()
-    return inverse * mechanics.inertia, _NodeSolution(
-        x, solution[0], solution[1:], reverse_acceleration, condition, determinant_ratio
-    )
+    found = _NodeSolution(x, solution[0], solution[1:], reverse_acceleration, condition, determinant_ratio)
+    return inverse * mechanics.inertia, local.constraint_inverse, found

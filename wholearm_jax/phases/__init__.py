@@ -1,6 +1,6 @@
 """Phases one after the other: trace, simulate, assess, describe, sample, differentiate."""
 
-from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, IMPULSE_ROUNDING, assess_phase
+from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, assess_phase
 from wholearm_jax.phases.closed_loop import (
     CLOSED_LOOP_STEPS,
     CLOSED_LOOP_TOLERANCE,
@@ -13,6 +13,7 @@ from wholearm_jax.phases.closed_loop import (
 )
 from wholearm_jax.phases.closed_loop_result import closed_loop_result
 from wholearm_jax.phases.compressive_margin import margin
+from wholearm_jax.phases.contact_opening import IMPULSE_ROUNDING, MAX_OPENING, ContactOpening, contact_opening
 from wholearm_jax.phases.gradients import check_gradient
 from wholearm_jax.phases.hand_overs import (
     HandOver,

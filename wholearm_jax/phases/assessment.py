@@ -7,8 +7,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import Status
 from wholearm_jax.dynamics import Impact, PathDynamics
-from wholearm_jax.margin import MarginResult, force_slack
+from wholearm_jax.margin import MarginResult
 from wholearm_jax.model import Arrival
+from wholearm_jax.phases.contact_opening import MAX_OPENING, ContactOpening
 from wholearm_jax.simulation import Motion
 
 DEFAULT_ARRIVAL = 1e-6  # distance from its path's end, in path lengths, within which a phase must end
@@ -16,8 +17,6 @@ ARRIVAL_SPEED_FACTOR = 12.0
 """Speed allowed at arrival: within a distance `a` of the end, in path lengths, it is at most `sqrt(12 a)` path lengths
 per duration, from which braking at 6 lengths per duration squared (the uniform rest-to-rest motion) stops within `a`.
 Nearer to the end, time and position do not fix the speed better than this square root."""
-
-IMPULSE_ROUNDING = 1e-9  # fraction of `Impact.size` by which rounding may make an impulse negative
 
 
 class Assessment(NamedTuple):
@@ -34,15 +33,16 @@ def assess_phase(
     margin_result: MarginResult,
     goal: Arrival | Int[Array, ""],
     impact: Impact,
+    opening: ContactOpening,
     arrival: float | Float[Array, ""] = DEFAULT_ARRIVAL,
     is_slow: Bool[Array, ""] | None = None,
 ) -> Assessment:
     """Decide the status of a phase from the earliest trouble.
 
-    In order of precedence: a path that cannot be traced, an impulse that would pull or throw the object back at entry,
-    a tensile force, then how the motion ended; a path that ends at an obstacle of the hand is not ok. A phase that
-    holds the object fails when it departs: `reversed`
-    backward, `not_reached` forward in the direction in which its path was traced.
+    In order of precedence: a path that cannot be traced, an impulse at entry that opens a contact by more than
+    `MAX_OPENING` or throws the object back, a tensile force, then how the motion ended; a path that ends at an obstacle
+    of the hand is not ok. A phase that holds the object fails when it departs: `reversed` backward, `not_reached`
+    forward in the direction in which its path was traced.
 
     Args:
         dynamics: Tabulated path dynamics.
@@ -50,19 +50,18 @@ def assess_phase(
         margin_result: Margin of the motion, with the first loss of contact.
         goal: How the phase must end, an `Arrival`.
         impact: Impact at which the phase is entered.
+        opening: How far a contact opens then.
         arrival: Distance from the path's end within which the phase must end, in path lengths.
         is_slow: Whether the motion ends slowly enough for a rest (None: by `ARRIVAL_SPEED_FACTOR`).
     """
     holds = goal == Arrival.HOLD
-    slack = force_slack(dynamics, impact.impulse)  # impulses have the cones of forces
-    pulls = slack.min() < -IMPULSE_ROUNDING * impact.size
     contact_lost, end_time = int(Status.CONTACT_LOST), motion.phase_time[motion.count]
     is_lost = jnp.isfinite(margin_result.loss_time) & ~holds
     hold_status, departure_time = _assess_hold(motion)
     arrival_status = _assess_arrival(dynamics, motion, goal == Arrival.AT_REST, arrival, is_slow)
     rows = (  # condition, status, phase time, contact
         (dynamics.status != int(Status.OK), dynamics.status, 0.0, -1),
-        (pulls, contact_lost, 0.0, jnp.argmin(slack)),
+        (opening.height > MAX_OPENING, contact_lost, 0.0, opening.contact),
         (impact.speed < 0, int(Status.REVERSED), 0.0, -1),
         (is_lost, contact_lost, margin_result.loss_time, margin_result.loss_contact),
         (holds, hold_status, departure_time, -1),

@@ -12,9 +12,10 @@ from jaxtyping import Array, Float, Int
 
 from wholearm_jax.core import CachedJit, Status, as_device_array, as_strong_array
 from wholearm_jax.dynamics import Impact, PathDynamics, evaluate, locate_panel, placeholder_dynamics, resolve_impact
-from wholearm_jax.margin import MarginResult, minimum_margin
+from wholearm_jax.margin import MarginResult, contact_force, minimum_margin
 from wholearm_jax.model import Arrival, TorqueSchedule, restrict_to_phase, uniform_schedule
 from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL, Assessment, assess_phase
+from wholearm_jax.phases.contact_opening import ContactOpening, contact_opening
 from wholearm_jax.phases.phase_tracing import MIN_LENGTH
 from wholearm_jax.simulation import Actuation, IntegratorOptions, Motion, simulate_motion, tolerance_as_data
 from wholearm_jax.tracing import Resolution
@@ -26,6 +27,7 @@ class SimulatedPhase(NamedTuple):
     start: Float[Array, ""]  # [s], from the plan's start
     duration: Float[Array, ""]  # [s] available
     impact: Impact  # at which the phase is entered
+    opening: ContactOpening  # of a contact at which that would have to pull
     motion: Motion
     margin_result: MarginResult
     assessment: Assessment
@@ -110,11 +112,14 @@ def simulate_under(
     margin_result = eqx.tree_at(lambda r: r.margin, margin_result, margin)
     # Assess the end, and evaluate the velocity there.
     slow = None if is_slow is None else is_slow(motion)
-    assessment = assess_phase(dynamics, motion, margin_result, goal, impact, arrival, slow)
+    first = motion.segment[0], motion.row[0], motion.phase_time[0], motion.s[0], motion.w_begin[0]
+    remembered = None if motion.memory is None else motion.memory[0]
+    opening = contact_opening(dynamics, impact, contact_force(dynamics, actuation, duration, *first, remembered))
+    assessment = assess_phase(dynamics, motion, margin_result, goal, impact, opening, arrival, slow)
     last = jnp.maximum(motion.count - 1, 0)
     panel, xi = locate_panel(dynamics, motion.segment[last], motion.s[motion.count])
     exit_velocity = evaluate(dynamics.velocity, panel, xi) * motion.w[motion.count] / duration
-    return SimulatedPhase(start, duration, impact, motion, margin_result, assessment, exit_velocity)
+    return SimulatedPhase(start, duration, impact, opening, motion, margin_result, assessment, exit_velocity)
 
 
 def precompile_simulation(rows: int, options: IntegratorOptions) -> None:

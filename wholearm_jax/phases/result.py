@@ -31,7 +31,8 @@ class PhaseResult:
     """A simulated phase, readable: times in seconds from the plan's start, contacts by name, forces in newtons.
 
     `time` is when the phase ended or failed. A phase that is entered while moving begins at `start` with `impulses`
-    [N s], one a contact. `detail` names what is in the way where the phase cannot begin, ends at an
+    [N s], one a contact; where one would have to pull, `opened` is the contact that opens instead, by `opening` [m].
+    `detail` names what is in the way where the phase cannot begin, ends at an
     obstacle or cannot be held by any torque, and `remedy` what helps then.
     `slip_velocity` says that the contact lost is one that should roll, and that it leaves its friction cone.
     `margin` is the least force while the object moves; while friction holds it at rest forces are not determined, and
@@ -52,6 +53,8 @@ class PhaseResult:
     margin_s: float
     margin_contact: str
     impulses: tuple[float, ...]
+    opening: float
+    opened: str | None
     holds: tuple[RestInterval, ...]
     traced: TracedPhase
     outcome: SimulatedPhase
@@ -62,7 +65,9 @@ class PhaseResult:
     def message(self) -> str:
         """One line: which phase, what, which contact, when."""
         if self.status is Status.OK:
-            return f"{self.name}: ok, margin {self.margin:.4g} N at {self.margin_contact}, t = {self.margin_time:.4g} s"
+            at, begin = f"{self.margin_contact}, t = {self.margin_time:.4g} s", f"{self.opened} opens at its beginning"
+            opens = f"; {begin}, by {1e6 * self.opening:.2g} micrometres" if self.opened else ""
+            return f"{self.name}: ok, margin {self.margin:.4g} N at {at}{opens}"
         whose = f" at {self.contact}" if self.contact else ""
         advice = self.remedy or (SLIP_TOL if self.slips else self.status.advice)
         if self.detail:
@@ -133,6 +138,8 @@ def build_result(scene: Scene, torque: TorqueSchedule, traced, found) -> Result:
             margin_time=start + length * float(scored.phase_time),
             margin_s=float(scored.s),
             margin_contact=names[of_slot[int(scored.contact)]],
+            opening=(opening := float(outcome.opening.height)),
+            opened=names[of_slot[int(outcome.opening.contact)]] if opening > 0 else None,
             impulses=tuple(float(np.asarray(outcome.impact.impulse)[k]) for k in phase.formation.normal_rows),
             holds=_holds(scene, torque, phase, at, outcome, hand_over),
             traced=at,
