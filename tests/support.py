@@ -1,5 +1,6 @@
 """What tests of several folders share: scenes of layered hands, a torque that passes a path's end, differences."""
 
+import functools
 import itertools
 
 import equinox as eqx
@@ -18,6 +19,12 @@ from wholearm_jax.simulation import IntegratorOptions
 
 __all__ = ["layered", "layered_file"]  # for the tests
 DURATION = 1.0
+
+
+@functools.cache
+def optimised(name: str):
+    """The best schedule of a bundled scene, found once a process."""
+    return wa.optimise(wa.load(name))
 
 
 def passing(dynamics, knots=9):

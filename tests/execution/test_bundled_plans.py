@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import shapely
 from shapely.affinity import rotate, translate
-from support import layered
+from support import layered, optimised
 
 import wholearm_jax as wa
 from wholearm_jax.execution.executions import execute
@@ -26,7 +26,7 @@ END_OF_RANGE = {"box": {"finger1 reaches its range"}}  # where the plan itself e
 
 @pytest.fixture(scope="module", params=bundled())
 def optimum(request):
-    return request.param, wa.optimise(wa.load(request.param))
+    return request.param, optimised(request.param)
 
 
 def test_a_margin_near_the_bound(optimum):

@@ -3,6 +3,7 @@
 import equinox as eqx
 import numpy as np
 import pytest
+from support import optimised
 
 import wholearm_jax as wa
 from wholearm_jax.ensembles import make_ensemble
@@ -13,12 +14,12 @@ from wholearm_jax.files.scene_toml import parse, to_dict
 
 @pytest.fixture(scope="module")
 def flight():
-    return wa.optimise(wa.load("flight"))
+    return optimised("flight")
 
 
 def test_a_law_passes_from_phase_to_phase_in_time():
     """The reference goes on beyond a path's end, as it came: an object a little behind it does not wait there."""
-    optimum = wa.optimise(wa.load("passage"))
+    optimum = optimised("passage")
     law = wa.feedback(optimum.scene, optimum.torque)
     for phase in law.phases[:2]:
         assert phase.flows

@@ -10,7 +10,8 @@ import wholearm_jax as wa
 from wholearm_jax.dynamics import Impact
 from wholearm_jax.margin import MarginResult
 from wholearm_jax.model import Arrival
-from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, DEFAULT_ARRIVAL, IMPULSE_ROUNDING, assess_phase
+from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, DEFAULT_ARRIVAL, assess_phase
+from wholearm_jax.phases.contact_opening import MAX_OPENING, ContactOpening
 from wholearm_jax.simulation import Motion
 
 S = wa.Status
@@ -49,8 +50,24 @@ def scored(lost=np.inf, contact=-1):
     return MarginResult(**{name: jnp.asarray(value) for name, value in numbers.items()})
 
 
-def judged(dynamics, motion, goal=Arrival.AT_REST, margin_result=None, impact=CALM, arrival=DEFAULT_ARRIVAL):
-    found = assess_phase(dynamics, motion, margin_result or scored(), jnp.asarray(int(goal)), impact, arrival)
+def opened(height):
+    return ContactOpening(jnp.asarray(height), jnp.asarray(1e-3), jnp.asarray(2))
+
+
+CLOSED = opened(0.0)
+
+
+def judged(
+    dynamics,
+    motion,
+    goal=Arrival.AT_REST,
+    margin_result=None,
+    impact=CALM,
+    opening=opened(0.0),
+    arrival=DEFAULT_ARRIVAL,
+):
+    code, scores = jnp.asarray(int(goal)), margin_result or scored()
+    found = assess_phase(dynamics, motion, scores, code, impact, opening, arrival)
     return S(int(found.status)), float(found.phase_time), int(found.contact)
 
 
@@ -111,33 +128,29 @@ def test_a_tensile_force_counts_before_how_the_motion_ends(dynamics):
     assert judged(dynamics, held, Arrival.HOLD, scored(0.4, 2)) == (S.OK, 1.0, -1), "forces at rest are not determined"
 
 
-SIZE = 3.0
-GOOD = [1.0, 2.0, 0.5, 0.1]
-IMPULSES = {
-    "none pulls": (0.1, GOOD, None),
-    "one is zero but for rounding": (0.1, [1.0, 2.0, 0.5, -IMPULSE_ROUNDING * SIZE * (1 - EDGE)], None),
-    "one pulls": (0.1, [1.0, -IMPULSE_ROUNDING * SIZE * (1 + EDGE), 0.5, 0.1], (S.CONTACT_LOST, 0.0, 1)),
-    "the one that pulls most is named": (0.1, [1.0, -0.1, -0.3, 0.1], (S.CONTACT_LOST, 0.0, 2)),
-    "thrown back": (-1e-12, GOOD, (S.REVERSED, 0.0, -1)),
-    "thrown back, and one pulls": (-0.1, [1.0, 2.0, 0.5, -0.1], (S.CONTACT_LOST, 0.0, 3)),
+OPENINGS = {
+    "none opens": (0.1, 0.0, None),
+    "one opens as little as surfaces are rough": (0.1, MAX_OPENING * (1 - EDGE), None),
+    "one opens farther": (0.1, MAX_OPENING * (1 + EDGE), (S.CONTACT_LOST, 0.0, 2)),
+    "one does not close again": (0.1, np.inf, (S.CONTACT_LOST, 0.0, 2)),
+    "thrown back": (-1e-12, 0.0, (S.REVERSED, 0.0, -1)),
+    "thrown back, and one opens": (-0.1, 1.0, (S.CONTACT_LOST, 0.0, 2)),
 }
 
 
-@pytest.mark.parametrize(("speed", "impulse", "expected"), IMPULSES.values(), ids=IMPULSES.keys())
+@pytest.mark.parametrize(("speed", "height", "expected"), OPENINGS.values(), ids=OPENINGS.keys())
 @pytest.mark.parametrize("tensile", [False, True], ids=["", "tensile later"])
-def test_impacts_that_are_refused(dynamics, tensile, speed, impulse, expected):
+def test_impacts_that_are_refused(dynamics, tensile, speed, height, expected):
     """Before anything that happens later, and at the phase's beginning."""
-    entered = Impact(jnp.asarray(speed), jnp.asarray(impulse), jnp.asarray(SIZE))
+    entered, opening = CALM._replace(speed=jnp.asarray(speed)), opened(height)
     score = scored(0.4, 0) if tensile else scored()
     otherwise = (S.CONTACT_LOST, 0.4, 0) if tensile else (S.OK, 1.0, -1)
-    assert judged(dynamics, moved(dynamics, S.OK), margin_result=score, impact=entered) == (expected or otherwise)
+    found = judged(dynamics, moved(dynamics, S.OK), margin_result=score, impact=entered, opening=opening)
+    assert found == (expected or otherwise)
 
 
 def test_a_path_that_cannot_be_traced_counts_before_all(dynamics):
     untraced = eqx.tree_at(lambda t: t.status, dynamics, jnp.asarray(int(S.NO_CONVERGENCE), dynamics.status.dtype))
-    pulled = Impact(jnp.asarray(-1.0), -jnp.ones(4), jnp.asarray(1.0))
-    assert judged(untraced, moved(dynamics, S.OK), margin_result=scored(0.4, 2), impact=pulled) == (
-        S.NO_CONVERGENCE,
-        0.0,
-        -1,
-    )
+    back = CALM._replace(speed=jnp.asarray(-1.0))
+    found = judged(untraced, moved(dynamics, S.OK), margin_result=scored(0.4, 2), impact=back, opening=opened(np.inf))
+    assert found == (S.NO_CONVERGENCE, 0.0, -1)

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from reference.unreduced import Model
 from scipy.integrate import solve_ivp
+from support import optimised
 
 import wholearm_jax as wa
 from wholearm_jax.dynamics import evaluate, locate_panel, resolve_impact
 from wholearm_jax.feedback import law_tables
 from wholearm_jax.files.scene_toml import to_dict
-from wholearm_jax.phases import MAX_OPENING, closed_loop_result, contact_opening
+from wholearm_jax.phases import IMPULSE_ROUNDING, MAX_OPENING, closed_loop_result, contact_opening
 from wholearm_jax.phases.phase_ends import start_configuration
 
 TORQUES = np.linspace(-0.9, 0.9, 19)
@@ -122,11 +123,21 @@ def test_what_does_not_close_again_is_open_without_end(entry):
     assert (float(rest.height), float(rest.duration)) == (0.0, 0.0)
 
 
+def test_an_impulse_that_pulls_by_rounding_opens_nothing(entry):
+    _, dynamics, direction = entry
+    impact = resolve_impact(dynamics, jnp.asarray(0.01 * direction))
+    edge = IMPULSE_ROUNDING * float(impact.size)
+    for share, opens in ((0.999, False), (1.001, True)):
+        almost = impact._replace(impulse=jnp.abs(impact.impulse).at[1].set(-share * edge))
+        found = contact_opening(dynamics, almost, jnp.ones(4))
+        assert (float(found.height) > 0, int(found.contact)) == (opens, 1)
+
+
 def test_a_contact_that_opens_farther_than_surfaces_are_rough_is_lost():
     """And one that opens less is kept, and told of."""
     scene = wa.load("flight")
     scene = eqx.tree_at(lambda s: s.object.friction, scene, scene.object.friction * jnp.array([1.2, 0.8, 0.8]))
-    _, second, third = wa.simulate(scene, wa.optimise(wa.load("flight")).torque).phases
+    _, second, third = wa.simulate(scene, optimised("flight").torque).phases
     assert (second.opened, third.opened) == ("palm:v3", "palm:v3")
     assert min(second.impulses) < 0 > min(third.impulses)
     assert second.opening > MAX_OPENING > third.opening > 0
@@ -137,7 +148,7 @@ def test_a_contact_that_opens_farther_than_surfaces_are_rough_is_lost():
 def test_under_a_law_objects_are_kept_where_contacts_open_for_an_instant():
     """Free bodies arrive so, with every contact touching (`benchmarks/feedback.py`)."""
     scene = wa.load("flight")
-    law = wa.feedback(scene, wa.optimise(scene).torque, friction=0.2)
+    law = wa.feedback(scene, optimised("flight").torque, friction=0.2)
     frictions = [scene.object.friction * jnp.array(factors) for factors in ((1.2, 0.8, 0.8), (1.2, 0.8, 1.2))]
     scenes = [eqx.tree_at(lambda s: s.object.friction, scene, friction) for friction in frictions]
     checked = wa.check(scenes, controller=law)
