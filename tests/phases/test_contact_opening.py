@@ -142,6 +142,7 @@ def test_a_contact_that_opens_farther_than_surfaces_are_rough_is_lost():
     assert min(second.impulses) < 0 > min(third.impulses)
     assert second.opening > MAX_OPENING > third.opening > 0
     assert (second.status, second.contact, second.time) == (wa.Status.CONTACT_LOST, "palm:v3", second.start)
+    assert "the impact at its beginning opens it by 12 micrometres; press it harder there" in second.message
     assert third.status is not wa.Status.CONTACT_LOST
 
 

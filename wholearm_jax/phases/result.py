@@ -20,6 +20,7 @@ from wholearm_jax.phases.standing_fingers import find_standing_defect, hold_duri
 from wholearm_jax.tracing import PathEnd
 
 SLIP_TOL = "it should roll, but leaves its friction cone and slips; squeeze it harder, move more slowly, or optimise"
+OPENING_ADVICE = "press it harder there, or enter the phase more slowly"
 REFUSED_STARTS = (Status.LEFT_FORMATION, Status.OBSTACLE)  # statuses of a path that mean that it cannot begin
 REMEDY_START = "the path cannot begin there: correct the start's pose and angles, or choose other contacts or fingers"
 UNTIL_FRACTION = 0.05  # of a path that ends at an obstacle, which the advice leaves out
@@ -70,6 +71,9 @@ class PhaseResult:
             return f"{self.name}: ok, margin {self.margin:.4g} N at {at}{opens}"
         whose = f" at {self.contact}" if self.contact else ""
         advice = self.remedy or (SLIP_TOL if self.slips else self.status.advice)
+        if self.status is Status.CONTACT_LOST and self.opened == self.contact and self.time == self.start:
+            how_far = f"by {1e6 * self.opening:.2g} micrometres" if np.isfinite(self.opening) else "for good"
+            advice = f"the impact at its beginning opens it {how_far}; {OPENING_ADVICE}"
         if self.detail:
             advice = f"{self.detail}; {advice}"
         rests = self.status is Status.STUCK and self.holds
