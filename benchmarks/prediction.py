@@ -14,8 +14,8 @@ speed: its plan says nothing about the impact that follows; and one in which a p
 What counts, by the same tolerances on both sides:
 
 - *predicted to hold*: no contact force is tensile for `FREE` running while its phase lasts (`MARGIN_OF_TIME` at either
-  end left out), no impulse pulls, no hold is infeasible, and every phase ends within `TOLERANCE` (0.5 mm, 0.01 rad) of
-  its path's end;
+  end left out), no impact opens a contact by more than a micrometre, no hold is infeasible, and every phase ends within
+  `TOLERANCE` (0.5 mm, 0.01 rad) of its path's end;
 - *executed to hold*: `execution.execute` at 0.05 ms ends `ok` (within the same tolerance, the last contacts closed to
   0.5 mm), where a phase should end at rest the object is within the tolerance, and no contact of a formation was open
   for `FREE` running, its phase's ends left out alike. Open is a gap of more than `OPEN`: where forces settle anew, as
@@ -52,7 +52,7 @@ from wholearm_jax.execution import CONVEX, ContactCompliance, ExecutionOutcome, 
 from wholearm_jax.files import to_dict
 from wholearm_jax.margin import affine_coefficients
 from wholearm_jax.model import Arrival, pad_schedule
-from wholearm_jax.phases import Result, sample_phase, target_configuration
+from wholearm_jax.phases import MAX_OPENING, Result, sample_phase, target_configuration
 from wholearm_jax.plotting import LINK_COLOURS as COLOURS
 
 KNOTS, TIMESTEP = 51, 5e-5  # [s]
@@ -164,8 +164,7 @@ def _bears(phase) -> bool:
 
 def _lasts(phase, course) -> bool:
     """Whether no contact of a phase would have to pull for `FREE` or longer, while formations do not change."""
-    pulls = bool(phase.impulses) and min(phase.impulses) < 0
-    refused = pulls or any(held.loss_time is not None for held in phase.holds)
+    refused = phase.opening > MAX_OPENING or any(held.loss_time is not None for held in phase.holds)
     return _bears(phase) or (phase.status is Status.CONTACT_LOST and not refused and _dip(phase, course) < FREE)
 
 
