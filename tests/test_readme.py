@@ -13,6 +13,7 @@ def test_the_python_lines_run(tmp_path, monkeypatch):
     code = re.search(r"```python\n(.*?)```", text, re.DOTALL)
     assert code is not None
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("JAX_ENABLE_COMPILATION_CACHE", "true")  # leave the user's cache folder alone
     names = {}
     exec(code.group(1), names)
     assert (tmp_path / "result.png").stat().st_size > 10_000
