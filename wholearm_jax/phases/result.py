@@ -66,9 +66,8 @@ class PhaseResult:
     def message(self) -> str:
         """One line: which phase, what, which contact, when."""
         if self.status is Status.OK:
-            at, begin = f"{self.margin_contact}, t = {self.margin_time:.4g} s", f"{self.opened} opens at its beginning"
-            opens = f"; {begin}, by {1e6 * self.opening:.2g} micrometres" if self.opened else ""
-            return f"{self.name}: ok, margin {self.margin:.4g} N at {at}{opens}"
+            least = f"margin {self.margin:.4g} N at {self.margin_contact}, t = {self.margin_time:.4g} s"
+            return f"{self.name}: ok, {least}{self._opening_note}"
         whose = f" at {self.contact}" if self.contact else ""
         advice = self.remedy or (SLIP_TOL if self.slips else self.status.advice)
         if self.status is Status.CONTACT_LOST and self.opened == self.contact and self.time == self.start:
@@ -80,6 +79,14 @@ class PhaseResult:
         since = f", at rest since {self.holds[-1].start:.6g} s" if rests else ""
         when = f", t = {self.time:.6g} s" if np.isfinite(self.time) else ""
         return f"{self.name}: {self.status.label}{whose}{when}{since}: {advice}"
+
+    @property
+    def _opening_note(self) -> str:
+        """How far and for how long an impact opens a contact that is kept."""
+        if not self.opened:
+            return ""
+        height, duration = 1e6 * self.opening, 1e3 * float(self.outcome.opening.duration)
+        return f"; {self.opened} opens at its beginning, by {height:.2g} micrometres for {duration:.2g} ms"
 
 
 @dataclass(frozen=True)
