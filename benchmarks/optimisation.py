@@ -16,7 +16,6 @@ the same, and `--references` finds those that are missing and does nothing else.
 """
 
 import argparse
-import inspect
 import json
 import statistics
 import time
@@ -33,10 +32,11 @@ from matplotlib import pyplot as plt
 from random_plans import random_plans
 
 import wholearm_jax as wa
+from wholearm_jax.optimisation import DEFAULT_KNOTS
 
 BUNDLED, RANDOM = (1.0, 0.3, 0.15), (1.0, 0.3)  # durations of a phase [s]
 PLANS, SEED = 12, 0
-USUAL = inspect.signature(wa.optimise).parameters["knots"].default
+USUAL = DEFAULT_KNOTS
 NEAR = 0.99  # share of the reference that counts as equal
 
 

@@ -21,7 +21,7 @@ RUNS = {  # what each runs, after `import NAME as module`
     "flying_plans": "run('--count', '1', '--phases', '2')",
     "gradients": "module.KNOTS, module.TOLERANCES = (4,), (1e-4,); run('--quick')",
     "interruption": "run('--runs', '1', '--latest', '3')",
-    "optimisation": "module.random_plans = lambda *_: (); run('--quick', '--knots', '8')",
+    "optimisation": "module.random_plans = lambda *_: (); run('--quick')",
     "planning": "module.PLANNERS = {'rolling': {}, 'random tree': None}; run('--quick')",
     "plan_executions": "run('--quick')",
     "prediction": "module.SORTS, module.TIMESTEP = {'stopping': 1}, 4e-4; run('--quick', '--seeds', '0')",
