@@ -36,7 +36,6 @@ from wholearm_jax.optimisation import DEFAULT_KNOTS
 
 BUNDLED, RANDOM = (1.0, 0.3, 0.15), (1.0, 0.3)  # durations of a phase [s]
 PLANS, SEED = 12, 0
-USUAL = DEFAULT_KNOTS
 NEAR = 0.99  # share of the reference that counts as equal
 
 
@@ -91,7 +90,9 @@ def main() -> None:
     wa.configure()
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="bundled plans and four random ones, 1.0 s; saves nothing")
-    parser.add_argument("--knots", type=int, default=USUAL, help="torques a joint and phase, for both optimisers")
+    parser.add_argument(
+        "--knots", type=int, default=DEFAULT_KNOTS, help="torques a joint and phase, for both optimisers"
+    )
     parser.add_argument("--references", action="store_true", help="only find the references that are missing")
     chosen = parser.parse_args()
     if chosen.references:
@@ -106,7 +107,7 @@ def main() -> None:
     summary = _summary(cases)
     print(json.dumps(summary, indent=1))
     if not chosen.quick:
-        name = "optimisation" if chosen.knots == USUAL else f"optimisation_{chosen.knots}_knots"
+        name = "optimisation" if chosen.knots == DEFAULT_KNOTS else f"optimisation_{chosen.knots}_knots"
         rows = [asdict(case) for case in cases]
         measure.save(name, {"knots": chosen.knots, "summary": summary, "cases": rows})
         draw(cases, measure.RESULTS / f"{name}.svg")

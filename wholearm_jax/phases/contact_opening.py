@@ -49,12 +49,12 @@ def contact_opening(dynamics: PathDynamics, impact: Impact, force: Float[Array, 
     speed = -impact.impulse[j] / dynamics.contact_inertia[j, j]
     second = dynamics.contact_inertia[:, j] * speed  # impulses of the impact that shuts it
     first = (impact.impulse + second).at[j].set(0.0)
-    # Who opens, and how far; contacts that roll must not slip.
+    # Who opens, and how far; contacts that roll must neither open nor slip.
     opens = (second < 0).at[j].set(True)
     inertia = jnp.diagonal(dynamics.contact_inertia)
     closes = ~opens | ((force > 0) & (inertia > 0))
     rolls = dynamics.tangential | jnp.roll(dynamics.tangential, -1)
-    sticks = ~rolls | ((force_slack(dynamics, first) >= 0) & (force_slack(dynamics, second) >= 0) & ~opens)
+    sticks = ~rolls | ((force_slack(dynamics, second) >= 0) & ~opens)
     pushes = force_slack(dynamics, first) >= 0
     known = (pulls.sum() == 1) & (speed > 0) & (closes & sticks & pushes).all()
     height = jnp.where(known, jnp.where(opens, second**2 / (2 * force * inertia), 0.0).max(), jnp.inf)
