@@ -123,6 +123,21 @@ def test_what_does_not_close_again_is_open_without_end(entry):
     assert (float(rest.height), float(rest.duration)) == (0.0, 0.0)
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_contact_that_rolls_may_be_pushed_to_either_side_within_its_cone(entry, side):
+    """Scenes and their mirror images are judged alike."""
+    _, dynamics, direction = entry
+    impact = resolve_impact(dynamics, jnp.asarray(0.01 * direction))
+    impact = impact._replace(impulse=jnp.array([-0.01, 1.0, 1.0, 0.0]))  # the last two are one contact that rolls
+    inertia = jnp.eye(4).at[2:, 0].set(jnp.array([1.0, 0.2 * side]))
+    rolling = jnp.arange(4) == 3
+    for friction, sticks in ((0.3, True), (0.1, False)):
+        numbers = rolling, friction * rolling, inertia
+        changed = eqx.tree_at(lambda d: (d.tangential, d.rolling_friction, d.contact_inertia), dynamics, numbers)
+        found = contact_opening(changed, impact, jnp.ones(4))
+        assert float(found.height) == (pytest.approx(0.01**2 / 2) if sticks else np.inf)
+
+
 def test_an_impulse_that_pulls_by_rounding_opens_nothing(entry):
     _, dynamics, direction = entry
     impact = resolve_impact(dynamics, jnp.asarray(0.01 * direction))

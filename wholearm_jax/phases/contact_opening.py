@@ -50,7 +50,7 @@ def contact_opening(dynamics: PathDynamics, impact: Impact, force: Float[Array, 
     second = dynamics.contact_inertia[:, j] * speed  # impulses of the impact that shuts it
     first = (impact.impulse + second).at[j].set(0.0)
     # Who opens, and how far; contacts that roll must neither open nor slip.
-    opens = (second < 0).at[j].set(True)
+    opens = ((second < 0) & ~dynamics.tangential).at[j].set(True)
     inertia = jnp.diagonal(dynamics.contact_inertia)
     closes = ~opens | ((force > 0) & (inertia > 0))
     rolls = dynamics.tangential | jnp.roll(dynamics.tangential, -1)
