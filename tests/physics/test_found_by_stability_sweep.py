@@ -1,6 +1,5 @@
 """Scenes at the edge: paths that turn far or meet another, wedging on the way back, tiny pieces, many stops."""
 
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -32,7 +31,7 @@ from wholearm_jax.phases.phase_tracing import trace_phase
 from wholearm_jax.phases.plan_simulation import simulate_phases
 from wholearm_jax.phases.sampling import sample_phase
 from wholearm_jax.simulation import IntegratorOptions, quintic_hermite, simulate_motion
-from wholearm_jax.tracing.events import EventValues, detect_events
+from wholearm_jax.tracing.events import EventFunctions, EventValues, detect_events
 from wholearm_jax.tracing.path import Resolution
 from wholearm_jax.tracing.start_checks import lie_before_link, link_penetrates_object, violates_contact_limits
 
@@ -268,11 +267,16 @@ def test_a_dip_between_samples_is_found_among_many_low_steps(floor):
     assert floor > 0 or int(found.loss_contact) == 2
 
 
+def _watched(**crossings):
+    """Event functions of which only the crossings matter: the other fields stay empty."""
+    return EventFunctions(**dict.fromkeys(EventFunctions._fields) | crossings)
+
+
 @pytest.mark.parametrize("side", [1, -1])
 def test_what_passes_and_comes_back_within_a_step_is_met_on_its_way_down(side):
     """A vertex that grazes a finger, or its back: it dips through soon, and is back to rounding where the step ends."""
     lower, upper = jnp.array([0.0, -jnp.inf]), jnp.array([1.0, jnp.inf])
-    watch = SimpleNamespace(
+    watch = _watched(
         lower=lower,
         upper=upper,
         is_terminal=jnp.array([True, True]),
@@ -463,7 +467,7 @@ def test_what_touches_and_sinks_is_met_at_once():
     after = EventValues(values=old + 1e-3, rates=-leaving + 0.01, along=old)
     unlimited = jnp.full(2, jnp.inf)
     flags = {"two_sided": old > 1, "may_part": old > 1, "is_terminal": old == 0}
-    events = SimpleNamespace(lower=-unlimited, upper=unlimited, half_width=old, **flags)
+    events = _watched(lower=-unlimited, upper=unlimited, half_width=old, **flags)
     crossed, where = detect_events(events, before, after, step, tolerance)
     np.testing.assert_array_equal(crossed, [True, False])
     assert 0 <= float(where[0]) < 1e-6

@@ -1,7 +1,7 @@
 """The hand that is found: its plan arrives, no hand that was tried has a larger certificate, and it is found again."""
 
 import importlib
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import equinox as eqx
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax.files import read_outline
 from wholearm_jax.model import edge_on_palm, resting_configuration
+from wholearm_jax.planning import PlanningResult
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +75,7 @@ def test_the_search_widens_until_some_hand_has_a_plan(box, monkeypatch):
     def plan(scene, goal, *, max_nodes, **options):
         efforts.append(max_nodes)
         enough = max_nodes == 3 and float(scene.hand.length[0]) == 0.12
-        return SimpleNamespace(found=enough, plans=(SimpleNamespace(bound=1.0),))
+        return Mock(spec=PlanningResult, found=enough, plans=(Mock(bound=1.0),))
 
     monkeypatch.setattr(module, "plan", plan)
     monkeypatch.setattr(module, "EFFORTS", (1, 3, 9))

@@ -33,10 +33,11 @@ UsageError: Any = typer.BadParameter.__mro__[1]  # of the library beneath, which
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
-def _print_version(requested: bool) -> None:
+def _print_version(requested: bool) -> bool:
     if requested:
         print(f"wholearm_jax {metadata.version('wholearm_jax')}")
         raise typer.Exit
+    return requested
 
 
 @app.callback()

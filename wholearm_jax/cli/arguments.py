@@ -37,7 +37,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text
 Samples = Annotated[int, typer.Option(min=2, help="Rows a phase in trajectory.csv.")]
 
 
-def load_scene(name: str, changes: list[str] | None = None):
+def load_scene(name: str | Path, changes: list[str] | None = None):
     """Load a scene and apply the changes of `--set`."""
     from wholearm_jax.files import load
 

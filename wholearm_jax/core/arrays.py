@@ -66,4 +66,4 @@ def stack_trees(trees):
 
 def unstack_trees(stacked, count: int) -> tuple:
     """Split a stacked tree into its `count` trees."""
-    return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], stacked) for k in range(count))
+    return tuple(jax.tree.map(lambda leaf, k=k: leaf[k, ...], stacked) for k in range(count))

@@ -57,7 +57,7 @@ class PathDynamics(eqx.Module):
     status: Int[Array, ""]  # a `Status`
 
     @property
-    def length(self) -> Float[Array, ""]:
+    def length(self) -> Float[Array, "*lanes"]:
         """The path's extent in `s`."""
         return self.breakpoints[..., -1] - self.breakpoints[..., 0]
 
@@ -68,7 +68,7 @@ class PathDynamics(eqx.Module):
 
 
 def locate_panel(
-    dynamics: PathDynamics, segment: Int[Array, ""], s: Float[Array, ""]
+    dynamics: PathDynamics, segment: int | Int[Array, ""], s: float | Float[Array, ""]
 ) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """Find the panel of a segment nearest to `s`, and the panel coordinate `xi` of `s`.
 

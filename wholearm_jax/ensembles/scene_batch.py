@@ -55,7 +55,7 @@ class SceneBatch(eqx.Module):
 
     def draw(self, number: int | Int[Array, ""]) -> Scene:
         """Return scene number `number`."""
-        return jax.tree.map(lambda leaf: leaf[number], self.scenes)
+        return jax.tree.map(lambda leaf: leaf[number, ...], self.scenes)
 
     def select(self, numbers: np.ndarray) -> "SceneBatch":
         """Return the batch of some of the scenes, renumbered from 0."""

@@ -93,7 +93,7 @@ def reference(phase: PhaseLaw, since: float) -> tuple[float, float, Float[np.nda
     return float(s_ref), float(v_ref), torque
 
 
-def _interpolate(nodes: Float[np.ndarray, "nodes"], at: float, *tables: Float[np.ndarray, "nodes *shape"]) -> list:
+def _interpolate(nodes: Float[np.ndarray, "nodes"], at: float, *tables: Float[np.ndarray, "nodes ..."]) -> list:
     """Interpolate tables linearly; they are constant beyond their ends."""
     k = min(max(int(nodes.searchsorted(at, side="right")) - 1, 0), len(nodes) - 2)
     gap = nodes[k + 1] - nodes[k]

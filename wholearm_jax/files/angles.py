@@ -52,7 +52,7 @@ Angle = Annotated[float, Field(strict=True, allow_inf_nan=False), BeforeValidato
 
 def is_beyond_a_turn(angle: float) -> bool:
     """Say whether an angle [rad] is more than a whole turn, as degrees often are."""
-    return abs(angle) > 2 * math.pi
+    return bool(abs(angle) > 2 * math.pi)
 
 
 def doubtful_angles(data: dict[str, Any]) -> Iterator[str]:

@@ -47,10 +47,8 @@ def read_controller(path: str | Path) -> Controller:
     rows = content.get("phases")
     if not isinstance(rows, list) or not rows:
         raise BadInput(f"{path}: phases: needs at least one")
-    phases = tuple(_build(PhaseLaw, row, f"{path}: phases[{k}]", {}) for k, row in enumerate(rows))
-    for k, phase in enumerate(phases):
-        _require_shapes(phase, f"{path}: phases[{k}]")
-    return _build(Controller, content, str(path), {"phases": phases})
+    phases = tuple(_phase_law(row, f"{path}: phases[{k}]") for k, row in enumerate(rows))
+    return Controller(**_read_fields(Controller, content, str(path), {"phases": phases}))
 
 
 def _plain(value):
@@ -58,8 +56,15 @@ def _plain(value):
     return value.tolist() if isinstance(value, np.ndarray) else list(value) if isinstance(value, tuple) else value
 
 
-def _build(kind: type, content, where: str, given: dict):
-    """Build a dataclass from a JSON object, each field of the type that it is annotated with."""
+def _phase_law(content, where: str) -> PhaseLaw:
+    """Build the law of a phase from a JSON object."""
+    entries = _read_fields(PhaseLaw, content, where, {})
+    _require_shapes(entries, where)
+    return PhaseLaw(**entries)
+
+
+def _read_fields(kind: type, content, where: str, given: dict[str, Any]) -> dict[str, Any]:
+    """Read a dataclass's fields from a JSON object, each as the type that it is annotated with."""
     if not isinstance(content, dict):
         raise BadInput(f"{where}: must be an object")
     for field in fields(kind):
@@ -68,7 +73,7 @@ def _build(kind: type, content, where: str, given: dict):
         if field.name not in content:
             raise BadInput(f"{where}: {field.name}: is missing")
         given[field.name] = _converted(field.type, content[field.name], f"{where}: {field.name}")
-    return kind(**given)
+    return given
 
 
 def _converted(kind, value, where: str):
@@ -92,15 +97,15 @@ def _converted(kind, value, where: str):
     return tuple(numbers.tolist()) if getattr(kind, "__origin__", None) is tuple else numbers
 
 
-def _require_shapes(phase: PhaseLaw, where: str) -> None:
+def _require_shapes(entries: dict[str, Any], where: str) -> None:
     """Raise BadInput where tables do not fit together."""
     for base, others in (("s", ("theta", "tangent", "gain")), ("time", ("torque",))):
-        nodes = getattr(phase, base)
+        nodes = entries[base]
         if nodes.ndim != 1 or len(nodes) < 2 or np.any(np.diff(nodes) < 0):
             raise BadInput(f"{where}: {base}: must be at least two numbers that do not decrease")
         for name in others:
-            if getattr(phase, name).shape != (len(nodes), 2):
+            if entries[name].shape != (len(nodes), 2):
                 raise BadInput(f"{where}: {name}: must have two numbers for each of {base}")
     for name in ("s_ref", "v_ref"):
-        if getattr(phase, name).shape != phase.time.shape:
+        if entries[name].shape != entries["time"].shape:
             raise BadInput(f"{where}: {name}: must have one number for each of time")

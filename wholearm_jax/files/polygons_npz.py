@@ -1,4 +1,4 @@
-"""Polygons to put in a scene, total in one NumPy file.
+"""Polygons to put in a scene, all in one NumPy file.
 
 `vertices` (`n`, `k`, 2) [m], rows beyond a polygon's `count` (`n`) ignored; `count` may be left out where all have `k`
 vertices; `mass` (`n`) [kg] and `friction` (`n` or `n`, 3) may be vertices, otherwise they are the scene's. Density is
@@ -9,12 +9,13 @@ from pathlib import Path
 from zipfile import BadZipFile
 from zlib import error as ZlibError
 
+import equinox as eqx
 import jax
 import numpy as np
 
 from wholearm_jax.core import SceneError
 from wholearm_jax.ensembles import SceneBatch
-from wholearm_jax.model import Polygon, Scene, find_defect
+from wholearm_jax.model import Scene, find_defect
 
 _UNREADABLE = (OSError, ValueError, KeyError, AttributeError, TypeError, EOFError, BadZipFile, ZlibError)
 
@@ -60,9 +61,12 @@ def read_polygons(path: Path, scene: Scene) -> SceneBatch:
     coefficients = coefficients[:, None] if coefficients.ndim == 1 else coefficients
     friction = _read_positive(path, "friction", {"friction": coefficients}, (total, 3), None, strictly=False)
     _require_named_features(path, scene, count)
-    shape = Polygon(vertices=vertices, count=count, mass=mass, friction=friction)  # pyright: ignore
     repeated = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (total, *np.shape(leaf))), scene)
-    return SceneBatch(Scene(scene.title, repeated.gravity, repeated.hand, shape, repeated.start, repeated.phases))
+    return SceneBatch(eqx.tree_at(_shape, repeated, (vertices, count, mass, friction)))
+
+
+def _shape(scene: Scene) -> tuple:
+    return scene.object.vertices, scene.object.count, scene.object.mass, scene.object.friction
 
 
 def _require_polygons(path, vertices, count) -> None:

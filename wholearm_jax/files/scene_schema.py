@@ -3,7 +3,7 @@
 import difflib
 import math
 import re
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
@@ -228,7 +228,7 @@ class SceneTables(_Strict):
     phase: Annotated[list[PhaseTable], Field(min_length=1)]
 
     @model_validator(mode="after")
-    def _known_features(self) -> Self:
+    def _known_features(self) -> "SceneTables":
         count = len(self.object.vertices)
         names = [phase.name for phase in self.phase]
         for k, phase in enumerate(self.phase):

@@ -110,7 +110,7 @@ class _NewtonSystem(NamedTuple):
     solved_time: Float[Array, "nodes"]
 
 
-def solve_chain(programme: PathProgramme, margin: Float[Array, ""]) -> ChainSolution:
+def solve_chain(programme: PathProgramme, margin: float | Float[Array, ""]) -> ChainSolution:
     """Solve a path programme for the largest margin, or for the shortest time with a margin.
 
     Args:
@@ -139,7 +139,7 @@ def solve_chain(programme: PathProgramme, margin: Float[Array, ""]) -> ChainSolu
     return ChainSolution(at.x, at.multiplier, torque, duration(p, at.x.b), at.gap, at.residual, at.count, fine)
 
 
-def lagrangian(p: PathProgramme, solution: ChainSolution, margin: Float[Array, ""]) -> Float[Array, ""]:
+def lagrangian(p: PathProgramme, solution: ChainSolution, margin: float | Float[Array, ""]) -> Float[Array, ""]:
     """Lagrangian of the largest margin, or (given a `margin`) of the shortest time, at a solution that is held fixed.
 
     Its derivatives with respect to the programme and the margin are those of the optimum (envelope theorem).

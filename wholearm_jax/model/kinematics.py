@@ -238,7 +238,7 @@ def normal_jacobian(contacts: ContactSet, z: Float[Array, "5"]) -> Float[Array, 
     return _jacobian_along(contacts, at, at.normal)
 
 
-def tangential_jacobian(contacts: ContactSet, z: Float[Array, "5"]) -> Float[Array, "contacts 5"]:
+def tangential_jacobian(contacts: ContactSet, z: Float[Array | np.ndarray, "5"]) -> Float[Array, "contacts 5"]:
     """`G_t`, the paper's `[W_t^T, -J_t]`: slip velocity is `G_t z_dot`, the object against the link."""
     at = contact_kinematics(contacts, z)
     return _jacobian_along(contacts, at, _rotate_minus_90(at.normal))

@@ -68,7 +68,7 @@ def configuration_unit(length: Float[Array, ""]) -> Float[Array, "5"]:
 
 
 def scaled_mechanics(
-    body: RigidBody, hand: Hand, gravity: Float[Array, "2"], formation: ContactFormation
+    body: RigidBody, hand: Hand, gravity: Float[Array | np.ndarray, "2"], formation: ContactFormation
 ) -> ScaledMechanics:
     """Scale a formation by the object's size and mass."""
     real = jnp.arange(body.vertices.shape[0]) < body.count
@@ -111,7 +111,7 @@ def scaled_mechanics(
         inertia=jnp.concatenate([heavy, small_hand.inertia]),
         viscous=small_hand.viscous,
         dry=small_hand.dry,
-        gravity=gravity / length,
+        gravity=jnp.asarray(gravity) / length,
         length=length,
         mass=mass,
         torque_limit=hand.torque_limit,

@@ -149,7 +149,7 @@ class Phase(eqx.Module):
     name: str = eqx.field(static=True)
     formation: ContactFormation
     target: PathTarget
-    duration: Float[Array, ""]
+    duration: Float[Array | np.ndarray, ""]
     arrive: Arrival = eqx.field(static=True, default=Arrival.AT_REST)
     regrasp: str | None = eqx.field(static=True, default=None)
 
@@ -171,7 +171,7 @@ class Scene(eqx.Module):
     """
 
     title: str = eqx.field(static=True)
-    gravity: Float[Array, "2"]
+    gravity: Float[Array | np.ndarray, "2"]
     hand: Hand
     object: Polygon
     start: Float[Array, "5"]

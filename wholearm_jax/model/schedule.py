@@ -1,6 +1,6 @@
 """Torque schedules: two joint torques over time, linear between rows; a repeated time is a step."""
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,11 +16,11 @@ TIME_ROUNDING = 16  # times that differ by this many units of machine epsilon ar
 class TorqueSchedule(eqx.Module):
     """A torque schedule: `times` [s], non-decreasing, and `values` [N m], one row `(tau1, tau2)` a time.
 
-    A repeated time is a step: the first row holds before it, the second from it on.
+    A repeated time is a step: the first row holds before it, the second from it on. Batches have leading axes.
     """
 
-    times: Float[Array, "rows"]
-    values: Float[Array, "rows 2"]
+    times: Float[Array | np.ndarray, "*lanes rows"]
+    values: Float[Array | np.ndarray, "*lanes rows 2"]
 
 
 class PhaseSchedule(eqx.Module):
@@ -146,15 +146,16 @@ def pad_schedule(schedule: TorqueSchedule, multiple: int = ROW_MULTIPLE) -> Torq
     return TorqueSchedule(xp.concatenate([times, ramp], -1), xp.concatenate([values, rows], -2))
 
 
-def restrict_to_phase(schedule: TorqueSchedule, start: Float[Array, ""], duration: Float[Array, ""]) -> PhaseSchedule:
+def restrict_to_phase(
+    schedule: TorqueSchedule, start: float | Float[Array, ""], duration: float | Float[Array, ""]
+) -> PhaseSchedule:
     """Restrict a schedule to one phase.
 
     Rows within rounding of the phase's ends count as on them; otherwise a jump meant to fall between two phases could
     land inside one.
     """
-    times = schedule.times
-    gap = jnp.diff(times)
-    rise = jnp.diff(schedule.values, axis=0)
+    times, values = jnp.asarray(schedule.times), jnp.asarray(schedule.values)
+    gap, rise = jnp.diff(times), jnp.diff(values, axis=0)
     slope = jnp.where((gap > 0)[:, None], rise / jnp.where(gap > 0, gap, 1.0)[:, None], 0.0) * duration
     intervals = times.shape[0] - 1
     tolerance = TIME_ROUNDING * jnp.finfo(times.dtype).eps * (jnp.abs(start) + duration)
@@ -163,13 +164,14 @@ def restrict_to_phase(schedule: TorqueSchedule, start: Float[Array, ""], duratio
     first = jnp.clip(first, 0, intervals - 1)
     return PhaseSchedule(
         phase_time=(times - start) / duration,
-        values=schedule.values,
+        values=values,
         slope=slope,
         first=first,
         last=jnp.clip(last, first, intervals - 1),
     )
 
 
+@runtime_checkable
 class HasIntervals(Protocol):
     """What has intervals over phase time: a schedule, or a closed-loop law."""
 

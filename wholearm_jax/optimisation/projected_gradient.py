@@ -7,7 +7,7 @@ The solver (`iteration`) calls `init(p)` with the flattened variables, and at ea
 where `gradient` is zero: a method makes its own from `linear`. Its state has the fields of `OptimiserState`.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from wholearm_jax.optimisation.linearisation import LinearisedProblem, jacobian_
 from wholearm_jax.optimisation.riccati import project_step
 
 
+@runtime_checkable
 class OptimiserState(Protocol):
     """What the solver reads of a method's state."""
 

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import Status
@@ -34,7 +35,7 @@ def assess_phase(
     goal: Arrival | Int[Array, ""],
     impact: Impact,
     opening: ContactOpening,
-    arrival: float | Float[Array, ""] = DEFAULT_ARRIVAL,
+    arrival: float | Float[Array | np.ndarray, ""] = DEFAULT_ARRIVAL,
     is_slow: Bool[Array, ""] | None = None,
 ) -> Assessment:
     """Decide the status of a phase from the earliest trouble.

@@ -47,9 +47,9 @@ def describe_obstacle(scene: Scene, z: Float[Array, "5"], row: int) -> str:
     return f"{finger}{part} meets {other} {float(_place(scene, z, row)):.3g} m from its joint"
 
 
-def _place(scene: Scene, z, row: int) -> Float[Array, ""]:
+def _place(scene: Scene, z, row: int) -> float:
     """Where on its line a row's corner is [m]."""
-    return jax.device_get(_places(scene.hand, z))[row]
+    return float(_places(scene.hand, z)[row])
 
 
 @jax.jit
@@ -57,7 +57,7 @@ def _places(hand, z):
     return contact_kinematics(link_obstacles(hand).contacts, z).along
 
 
-def describe_overlaps(scene: Scene, z: Float[Array, "5"], tolerance: float = 1e-9) -> tuple[str, ...]:
+def describe_overlaps(scene: Scene, z: Float[Array | np.ndarray, "5"], tolerance: float = 1e-9) -> tuple[str, ...]:
     """Say which links lie in one another or in the object at `z` (SI), at which feature and how deep.
 
     Args:

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from wholearm_jax.core import (
     BackgroundTask,
@@ -110,7 +111,7 @@ def simulate_phases(
     torque: TorqueSchedule,
     traced: tuple[TracedPhase, ...],
     options: IntegratorOptions,
-    arrival: float = DEFAULT_ARRIVAL,
+    arrival: float | Float[Array, ""] = DEFAULT_ARRIVAL,
 ) -> tuple[SimulatedPhase, ...]:
     """Simulate every phase; differentiable, and usable under any JAX transformation."""
     schedule, phases = pad_schedule(torque), list(zip(traced, scene.phases, strict=True))

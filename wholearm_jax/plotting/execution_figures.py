@@ -44,7 +44,7 @@ def plot_execution_strip(execution: Execution, poses: int = 8, axes=None) -> np.
     axes = pose_grid(axes, 2, (poses + 1) // 2, 0.95)
     shown = np.linspace(0, len(execution.course.time) - 1, axes.size).round().astype(int)
     for ax, row in zip(axes.flat, shown, strict=True):
-        _plot_step(execution, row, ax)
+        _plot_step(execution, int(row), ax)
     return axes
 
 
@@ -61,7 +61,7 @@ def animate(execution: Execution, frames_per_second: int = 25, ax: Axes | None =
 
     def show(row):
         ax.clear()
-        _plot_step(execution, row, ax)
+        _plot_step(execution, int(row), ax)
         ax.set_xlim(-across, across)
         ax.set_ylim(-0.1 * reach, 1.2 * reach)
         return ()

@@ -30,7 +30,7 @@ class DenseOutput(eqx.Module):
 
 
 def dense_output(
-    dynamics: PathDynamics, phase_schedule: Actuation, duration: Float[Array, ""], motion: Motion
+    dynamics: PathDynamics, phase_schedule: Actuation, duration: float | Float[Array, ""], motion: Motion
 ) -> DenseOutput:
     """Interpolate the steps of a motion."""
     # A step that takes no time has no speed of its own: its neighbours hold the speeds before and after it.

@@ -62,7 +62,7 @@ def split_into_segments(
 
 
 def distribute_panels(
-    breakpoints: Float[Array, "segments_1"], count: Int[Array, ""], resolution: Resolution
+    breakpoints: Float[Array, "segments_1"], count: int | Int[Array, ""], resolution: Resolution
 ) -> PanelLayout:
     """Distribute the panels over the segments by length, at least one each; the longest takes the remainder."""
     lengths = jnp.diff(breakpoints)
