@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from wholearm_jax.core import stack_trees
+from wholearm_jax.core import as_device_array, stack_trees
 from wholearm_jax.model import Scene
 
 
@@ -59,7 +59,8 @@ class SceneBatch(eqx.Module):
 
     def select(self, numbers: np.ndarray) -> "SceneBatch":
         """Return the batch of some of the scenes, renumbered from 0."""
-        return SceneBatch(jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), self.scenes))
+        # Chosen in NumPy: no program for each shape.
+        return SceneBatch(jax.tree.map(lambda leaf: as_device_array(np.asarray(leaf)[numbers]), self.scenes))
 
 
 def stack_scenes(scenes: Sequence[Scene]) -> Scene:

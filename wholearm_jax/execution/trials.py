@@ -23,11 +23,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from joblib import Parallel, delayed
 
-from wholearm_jax.core import Status, require_positive, unstack_trees
-from wholearm_jax.ensembles import make_ensemble, wilson_interval
+from wholearm_jax.core import CachedJit, Status, require_positive, unstack_trees
+from wholearm_jax.ensembles import Ensemble, make_ensemble, wilson_interval
 from wholearm_jax.execution.closed_loop import (
     ControlledMotor,
     Hardware,
@@ -235,13 +235,23 @@ def _draw_scenes(scene: Scene, amounts: Amounts, seed: int, count: int) -> tuple
         "vertices": amounts.geometry,
     }
     ensemble = make_ensemble(scene, spreads, seed=seed)
-    return unstack_trees(jax.device_get(jax.vmap(ensemble.draw)(jnp.arange(count))), count)
+    return unstack_trees(jax.device_get(_draw_many(ensemble, jnp.arange(count))), count)
+
+
+@CachedJit
+def _draw_many(ensemble: Ensemble, numbers: Int[Array, "scenes"]) -> Scene:
+    return jax.vmap(ensemble.draw)(numbers)
+
+
+@CachedJit
+def _draw_many_offsets(ensemble: Ensemble, numbers: Int[Array, "scenes"]) -> Float[Array, "scenes offsets"]:
+    return jax.vmap(ensemble.draw_offsets)(numbers)
 
 
 def _draw_displacements(scene: Scene, amounts: Amounts, seed: int, count: int) -> Float[np.ndarray, "count 3"]:
     """Draw displacements [m] of the object's start in x, y and, over the object's radius, phi."""
     ensemble = make_ensemble(scene, {"start": amounts.start}, seed=seed)
-    return np.asarray(jax.vmap(ensemble.draw_offsets)(jnp.arange(count)))[:, :3] * amounts.start
+    return np.asarray(_draw_many_offsets(ensemble, jnp.arange(count)))[:, :3] * amounts.start
 
 
 def start_near(scene: Scene, z, shift) -> Float[np.ndarray, "5"]:

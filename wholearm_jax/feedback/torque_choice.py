@@ -89,11 +89,13 @@ def _worst(acceleration, slack, speeds, a: float, limit, torque, g):
     answer = acceleration[:, 3:] @ g.T  # objects, turns
     opposed = answer.min(0) < LEAST_ANSWER
     alpha = missing[:, :, None] / np.where(opposed, 1.0, answer)[:, None, :]  # objects, x, turns
-    corrected = torque[None, :, None, :] + alpha[..., None] * g[None, None]
-    free = (slack[:, :, :3] @ speeds)[:, None, None, :]
-    forces = free + np.einsum("oft,oxgt->oxgf", slack[:, :, 3:], corrected)
-    margin = forces.min((0, 3))
-    over = np.maximum(np.abs(corrected) - limit, 0.0).max((0, 3)) + np.where(opposed, 1e3, 0.0)
+    # Forces and torques are affine in the correction; one facet, or motor, of all objects at a time stays in the cache.
+    force = (slack[:, :, :3] @ speeds)[:, :, None] + slack[:, :, 3:] @ torque.T  # objects, facets, x
+    force_rate = slack[:, :, 3:] @ g.T  # objects, facets, turns
+    forces = [(force[:, k, :, None] + alpha * force_rate[:, k, None]).min(0) for k in range(slack.shape[1])]
+    margin = np.min(forces, axis=0)
+    excess = [np.abs(torque[:, k, None] + alpha * g[:, k]).max(0) - limit[k] for k in range(len(limit))]
+    over = np.maximum(np.max(excess, axis=0), 0.0) + np.where(opposed, 1e3, 0.0)
     cost = TORQUE_COST * np.hypot(*torque.T)[:, None] + CORRECTION_COST * (RIPPLE + np.abs(alpha).max(0)) * np.hypot(
         *g.T
     )

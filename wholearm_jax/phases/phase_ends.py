@@ -2,8 +2,9 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from wholearm_jax.core import CachedJit
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.margin import RestAccelerations, Statics, contact_statics
 from wholearm_jax.model import (
@@ -12,7 +13,9 @@ from wholearm_jax.model import (
     PALM_END,
     Arrival,
     ContactFormation,
+    Hand,
     Phase,
+    Polygon,
     Scene,
     contact_kinematics,
     contact_name,
@@ -79,9 +82,15 @@ def ends_at_stop(scene: Scene, phase: Phase, traced: TracedPhase) -> bool:
     if int(traced.path.end_reason) != PathEnd.CONTACT_MADE:
         return False
     closed = formation_at_end(scene, phase, traced)
-    mechanics = scaled_mechanics(rigid_body(scene.object), scene.hand, scene.gravity, closed)
-    at = contact_kinematics(mechanics.contacts, jnp.asarray(traced.end) / mechanics.configuration_unit)
-    return not bool(hold_same_tip(mechanics.contacts, at, mechanics.contacts, at)[-1].any())
+    return not bool(_takes_over(scene.object, scene.hand, scene.gravity, closed, traced.end))
+
+
+@CachedJit
+def _takes_over(polygon: Polygon, hand: Hand, gravity, formation: ContactFormation, z) -> Bool[Array, ""]:
+    """Say whether the last contact of a formation takes over at `z` (SI) from another, at a vertex and a fingertip."""
+    mechanics = scaled_mechanics(rigid_body(polygon), hand, gravity, formation)
+    at = contact_kinematics(mechanics.contacts, z / mechanics.configuration_unit)
+    return hold_same_tip(mechanics.contacts, at, mechanics.contacts, at)[-1].any()
 
 
 def describe_end(scene: Scene, phase: Phase, traced: TracedPhase) -> str:
