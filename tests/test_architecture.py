@@ -1,6 +1,7 @@
 """The package is read top to bottom: who imports whom, what loads when; shapes decide what compiles."""
 
 import ast
+import contextlib
 import re
 import subprocess
 import sys
@@ -13,7 +14,12 @@ import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.model import polygon
+from wholearm_jax.ensembles import SceneBatch
+from wholearm_jax.ensembles.scene_batch import stack_scenes
+from wholearm_jax.execution import Amounts
+from wholearm_jax.execution.trials import _draw_scenes
+from wholearm_jax.model import link_overlaps, polygon
+from wholearm_jax.phases.phase_ends import ends_at_stop
 from wholearm_jax.phases.phase_simulation import _simulate_phase
 from wholearm_jax.phases.phase_tracing import trace_phase
 
@@ -188,23 +194,50 @@ def test_scenes_of_one_size_share_their_programs():
     assert len(compiled) == 1, f"a later scene compiled again: {compiled}"
 
 
-def test_reading_scenes_and_schedules_compiles_nothing():
-    """`jnp.asarray` of what is no array yet compiles a program for every shape, in every process anew."""
+@contextlib.contextmanager
+def compilations():
+    """Collect an entry for each program that is compiled meanwhile."""
     compiled = []
 
     def listen(event, _, **__):
-        compiled.append(event)
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
 
-    angle = np.linspace(0.0, 2 * np.pi, 37, endpoint=False)  # sizes that no other test has
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        polygon(np.stack([np.cos(angle), np.sin(angle)], axis=1), 1.0, 0.1)
-        wa.torque_schedule(np.linspace(0.0, 1.0, 37), np.zeros((37, 2)))
-        assert "/jax/core/compile/backend_compile_duration" not in compiled
-        jnp.arange(37.0) + 1
-        assert "/jax/core/compile/backend_compile_duration" in compiled  # the listener hears what is compiled
+        yield compiled
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def test_reading_scenes_and_schedules_compiles_nothing():
+    """`jnp.asarray` of what is no array yet compiles a program for every shape, in every process anew."""
+    angle = np.linspace(0.0, 2 * np.pi, 37, endpoint=False)  # sizes that no other test has
+    with compilations() as compiled:
+        polygon(np.stack([np.cos(angle), np.sin(angle)], axis=1), 1.0, 0.1)
+        wa.torque_schedule(np.linspace(0.0, 1.0, 37), np.zeros((37, 2)))
+        assert not compiled
+        jnp.arange(37.0) + 1
+    assert compiled  # the listener hears what is compiled
+
+
+def test_stacking_scenes_and_choosing_from_them_compiles_nothing():
+    """`jnp.stack` compiles a program for every count: half a minute for two thousand scenes."""
+    with compilations() as compiled:
+        many = stack_scenes([wa.load("heptagon")] * 37)
+        SceneBatch(many).select(np.arange(31))
+    assert not compiled
+
+
+def test_what_is_asked_of_a_plan_on_the_host_is_few_programs():
+    """Geometry that is not traced as a whole compiles an operation at a time: hundreds, in every process anew."""
+    scene = wa.load("heptagon")
+    traced = wa.trace(scene)
+    with compilations() as compiled:
+        assert ends_at_stop(scene, scene.phases[0], traced[0])
+        link_overlaps(scene.hand, scene.start[3:])
+        _draw_scenes(scene, Amounts(friction=0.1), seed=0, count=3)
+    assert len(compiled) <= 12
 
 
 def test_docstrings_name_modules_that_exist():

@@ -60,8 +60,9 @@ def set_row(rows, index: Int[Array, ""], row):
 
 
 def stack_trees(trees):
-    """Stack trees of one structure along a new leading axis."""
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+    """Stack trees of one structure along a new leading axis; numbers in NumPy: no program for each count."""
+    xp = jnp if is_traced(*trees) else np
+    return jax.tree.map(lambda *leaves: as_device_array(xp.stack(leaves)), *trees)
 
 
 def unstack_trees(stacked, count: int) -> tuple:

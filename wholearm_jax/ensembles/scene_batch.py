@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from wholearm_jax.core import as_device_array, stack_trees
+from wholearm_jax.core import as_device_array, is_traced, stack_trees
 from wholearm_jax.model import Scene
 
 
@@ -80,9 +80,10 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
 
 def _pad_polygon(scene: Scene, capacity: int) -> Scene:
     """Pad the polygon to `capacity` rows by repeating its last vertex."""
-    vertices = scene.object.vertices
-    padding = jnp.broadcast_to(vertices[-1], (capacity - vertices.shape[0], 2))
-    return eqx.tree_at(lambda s: s.object.vertices, scene, jnp.concatenate([vertices, padding]))
+    xp = jnp if is_traced(scene.object) else np
+    vertices = xp.asarray(scene.object.vertices)
+    padding = xp.broadcast_to(vertices[-1], (capacity - vertices.shape[0], 2))
+    return eqx.tree_at(lambda s: s.object.vertices, scene, xp.concatenate([vertices, padding]))
 
 
 def _with_names_of(scene: Scene, other: Scene) -> Scene:

@@ -164,6 +164,7 @@ def strip_middle(hand: Hand) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     return (front + behind) / 2, half_width
 
 
+@jax.jit
 def link_overlaps(hand: Hand, joint_angles: Float[Array, "2"]) -> Float[Array, "5"]:
     """Measure how deep the links of a hand lie in one another.
 

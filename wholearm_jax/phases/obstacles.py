@@ -69,7 +69,7 @@ def describe_overlaps(scene: Scene, z: Float[Array | np.ndarray, "5"], tolerance
         A line for each pair, the links among themselves first; empty where nothing overlaps.
     """
     radius = float(np.hypot(*np.asarray(rigid_body(scene.object).vertices).T).max())
-    between, palm1, palm2, beyond1, beyond2 = (float(v) for v in _overlaps(scene.hand, z[3:]))
+    between, palm1, palm2, beyond1, beyond2 = (float(v) for v in link_overlaps(scene.hand, z[3:]))
     lines = []
     if between > tolerance * radius:
         lines.append(f"finger1 and finger2 cross, {1e3 * between:.3g} mm deep")
@@ -81,9 +81,6 @@ def describe_overlaps(scene: Scene, z: Float[Array | np.ndarray, "5"], tolerance
             lines.append(f"finger{k + 1} is {np.degrees(angle):.3g} deg beyond its range")
     flush_tolerance = float(rigid_body(scene.object).flush_tolerance)
     return (*lines, *_object_overlaps(scene, z, max(tolerance * radius, flush_tolerance)))
-
-
-_overlaps = jax.jit(link_overlaps)
 
 
 def describe_refused_start(scene: Scene, phase: Phase, z: Float[Array, "5"]) -> str | None:
