@@ -115,6 +115,20 @@ def test_transformations_pass_by(folder):
     assert not list(folder.iterdir())
 
 
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_part_of_another_program_is_read_from_its_file(folder, kept):
+    """As where each of several devices calls it: the part is traced once for all processes, and equal."""
+    if not kept:
+        program_cache.enable_program_cache(None)
+    ramp, shape = Ramp(jnp.asarray(2.0), 2), jax.ShapeDtypeStruct((), jnp.float64)
+    for _ in range(2):  # two processes
+        part = program_cache.CachedJit(climb).embedded(ramp, shape)
+        found, others = jax.jit(lambda at, part=part: part(ramp, 2 * at))(jnp.asarray(1.5))
+        assert (float(found.slope), found.power, float(others["at"])) == (18.0, 2, 3.0)
+    assert ([2] if kept else [2, 2]) == TRACED
+    assert len(list(folder.iterdir())) == kept
+
+
 def apply(method, x):
     return method.update(x, method.init(x))[0]
 

@@ -37,6 +37,8 @@ PACKAGE_NAME = __name__.partition(".")[0]
 KEYED_PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "optax")
 FILE_HEADER = b"wholearm_jax program, format 1"
 
+DATA_TYPES = (*ARRAY_TYPES, jax.ShapeDtypeStruct)
+
 _folder: Path | None = None
 
 
@@ -59,12 +61,11 @@ class CachedJit:
         self._function, self._name = function, function.__qualname__
         self._compiler_options = compiler_options
         self._programs: dict[Any, Callable] = {}
+        self._embedded: dict[Any, Callable] = {}
         self._locks: dict[Any, threading.Lock] = {}
 
     def __call__(self, *args):
-        leaves, tree = jax.tree.flatten(args)
-        arrays = [leaf for leaf in leaves if isinstance(leaf, ARRAY_TYPES)]
-        settings = tuple([None if isinstance(leaf, ARRAY_TYPES) else (type(leaf), leaf) for leaf in leaves])
+        arrays, tree, settings = _separate(args)
         traced = is_traced(arrays)  # this call is a part of another program
         folder = None if traced else _folder
         shapes = folder and tuple([(array.shape, array.dtype) for array in arrays])
@@ -76,12 +77,27 @@ class CachedJit:
                 self._programs[key] = program
         return program(*arrays)
 
+    def embedded(self, *args) -> Callable:
+        """Return the function as a part of another program, for arguments like these (shapes alone serve, too).
+
+        Where programs are kept it is not traced again but comes from the folder, and then it has no derivatives.
+        """
+        arrays, tree, settings = _separate(args)
+        key = tree, settings, _folder, tuple([(array.shape, array.dtype) for array in arrays])
+        with self._locks.setdefault(key, threading.Lock()):
+            if key not in self._embedded:
+                kept = self._read_or_export(_folder, arrays, tree, settings) if _folder else None
+                self._embedded[key] = _call_within(*kept) if kept else self
+        return self._embedded[key]
+
     def _build(self, arrays, tree, settings, folder, traced: bool) -> Callable:
         """Return the program for such arguments, compiled where it comes from a folder."""
-        lowered = self._read_or_export(folder, arrays, tree, settings) if folder else None
-        if lowered:
+        kept = self._read_or_export(folder, arrays, tree, settings) if folder else None
+        if kept:
+            program, structure = kept
+            lowered = jax.jit(program.call).lower(*program.in_avals)
             start_queued()
-            return _compile(*lowered, self._compiler_options)
+            return _compile(lowered, structure, self._compiler_options)
         if traced:
             return jax.jit(self._of_arrays(tree, settings))
         program = jax.jit(self._of_arrays(tree, settings), compiler_options=self._compiler_options)
@@ -106,7 +122,7 @@ class CachedJit:
         return flat
 
     def _read_or_export(self, folder: Path, arrays, tree, settings):
-        """Return the lowered program and its result's structure, read from its file or exported and written to it.
+        """Return the program and its result's structure, read from its file or exported and written to it.
 
         None where the program has no name, or its result no description.
         """
@@ -115,8 +131,7 @@ class CachedJit:
             return None
         path = folder / name
         with contextlib.suppress(Exception):  # a file that cannot be read is written anew
-            program, structure = _read_program(path)
-            return _lower(program, structure)
+            return _read_program(path)
         program, structure = self._exported(arrays, tree, settings)
         description = describe_structure(structure)
         if description is None:
@@ -124,7 +139,7 @@ class CachedJit:
         with contextlib.suppress(OSError):  # a folder that cannot be written to keeps nothing
             path.parent.mkdir(parents=True, exist_ok=True)
             _write_program(path, program, description)
-        return _lower(program, structure)
+        return program, structure
 
     def _file_name(self, arrays, tree, settings) -> str | None:
         """Return the name of the file of a program; None where a setting has no stable name."""
@@ -169,8 +184,15 @@ def _read_program(path: Path):
     return export.deserialize(bytearray(program)), build_structure(json.loads(description))
 
 
-def _lower(program: export.Exported, structure):
-    return jax.jit(program.call).lower(*program.in_avals), structure
+def _separate(args) -> tuple[list, Any, tuple]:
+    """Return the arrays among arguments, their structure, and all other leaves with their types."""
+    leaves, tree = jax.tree.flatten(args)
+    arrays = [leaf for leaf in leaves if isinstance(leaf, DATA_TYPES)]
+    return arrays, tree, tuple([None if isinstance(leaf, DATA_TYPES) else (type(leaf), leaf) for leaf in leaves])
+
+
+def _call_within(program: export.Exported, structure) -> Callable:
+    return lambda *args: jax.tree.unflatten(structure, program.call(*_separate(args)[0]))
 
 
 def _compile(lowered, structure, compiler_options) -> Callable:

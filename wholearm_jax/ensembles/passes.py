@@ -6,6 +6,7 @@ the iterations they need; a GPU checks them side by side (`jax.vmap`). Where all
 traced once a block. With several devices, `shard_map` gives each its own block.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -73,11 +74,14 @@ def _precompile_checks(mesh: Mesh, common: tuple, numbers) -> None:
 
 def _call_on_devices(mesh: Mesh, program: CachedJit, common: tuple, *per_device):
     """Call a program with `common` arguments, and with `per_device` arguments split over the devices."""
-    return program(common, *per_device) if mesh.size == 1 else _call_sharded(mesh, program, common, *per_device)
+    if mesh.size == 1:
+        return program(common, *per_device)
+    own = jax.tree.map(lambda a: jax.ShapeDtypeStruct((len(a) // mesh.size, *a.shape[1:]), a.dtype), per_device)
+    return _call_sharded(mesh, program.embedded(common, *own), common, *per_device)
 
 
 @CachedJit
-def _call_sharded(mesh: Mesh, program: CachedJit, common: tuple, *per_device):
+def _call_sharded(mesh: Mesh, program: Callable, common: tuple, *per_device):
     """Call a program on every device with its own part of the `per_device` arguments."""
     arrays, static = eqx.partition(common, eqx.is_array)
 
