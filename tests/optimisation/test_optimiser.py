@@ -187,7 +187,8 @@ def test_a_formation_that_cannot_be_held_is_said_before_any_search():
 
 
 HARD = {
-    # At this pace full steps throw the least force from near its best to minus twenty times the bound and back.
+    # At this pace full steps throw the least force from near its best to minus twenty times the bound and back, and
+    # once more where damped steps have come near the solution.
     "circles where knots pass kinks": (
         [
             [0.0385, 0.0337, -0.0035, -0.026, -0.0405, -0.0289, 0.0097, 0.033],
@@ -196,7 +197,7 @@ HARD = {
         (0.28, 0.19),
         (0.04168, 0.03372, -0.59588, 1.52693, 0.56554),
         {"contacts": ["palm:v6", "palm:v7", "finger1:v1", "finger2:v4"], "toward": "x-", "duration": 0.3},
-        0.9,
+        0.985,
     ),
     # It crawls for most of its time: forward at all knots, but backward between them where only knots are looked at.
     "crawls": (

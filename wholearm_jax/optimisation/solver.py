@@ -2,8 +2,8 @@
 
 Full interior-point steps converge fastest but can cycle: when knots cross a kink of the path back and forth, or along
 directions in which the objective hardly changes. After a third of the iterations, cycling is damped by half steps, a
-merit test and a growing regularisation. Once the margin has settled, steps only close the defects, which converges
-quadratically. A solve ends early where it comes close to the solution from an earlier guess.
+merit test and a growing regularisation, from then on to the end. Once the margin has settled, steps only close the
+defects, which converges quadratically. A solve ends early where it comes close to the solution from an earlier guess.
 """
 
 import time
@@ -90,7 +90,8 @@ def solve(
 
         # Choose the next step: full, damped where iterates cycle, or closing the defects once the margin has settled.
         settled = _has_settled(problem, measures, record.margin - margin_before)
-        cycling = not settled and iteration >= problem.steps // 3 and measures.defect_norm > CYCLING_DEFECT
+        may_cycle = cycles > 0 or measures.defect_norm > CYCLING_DEFECT  # a full step would leave where cycles end
+        cycling = not settled and iteration >= problem.steps // 3 and may_cycle
         cycles, margin_before = cycles + int(cycling), record.margin
         d = replace(after, **(_CLOSING if settled else _damped(cycles) if cycling else _FULL))
     return d.p, f"the limit of {problem.steps} steps", history
