@@ -49,7 +49,7 @@ def describe_obstacle(scene: Scene, z: Float[Array, "5"], row: int) -> str:
 
 def _place(scene: Scene, z, row: int) -> float:
     """Where on its line a row's corner is [m]."""
-    return float(_places(scene.hand, z)[row])
+    return float(jax.device_get(_places(scene.hand, z))[row])
 
 
 @jax.jit
