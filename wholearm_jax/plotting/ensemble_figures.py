@@ -18,8 +18,8 @@ def plot_ensemble(
     summary: EnsembleSummary,
     influence: dict[str, float] | None = None,
     parameters: Sequence[tuple[str, np.ndarray]] = (),
-    axes: Sequence[Axes] | None = None,
-) -> Sequence[Axes]:
+    axes: Sequence[Axes] | np.ndarray | None = None,
+) -> Sequence[Axes] | np.ndarray:
     """Plot margins by status, the parameters that they depend on most, and the mean margin over two `parameters`.
 
     Args:

@@ -162,8 +162,9 @@ def object_outline(scene: Scene, z) -> np.ndarray:
     """Return the object's vertices `(n, 2)` [m] in the world at configuration `z`."""
     body = rigid_body(scene.object)
     corners = np.asarray(body.vertices)[: int(body.count)]
-    c, s = np.cos(z[2]), np.sin(z[2])
-    return corners @ np.array([[c, s], [-s, c]]) + z[:2]
+    x, y, phi = np.asarray(z)[:3]
+    c, s = np.cos(phi), np.sin(phi)
+    return corners @ np.array([[c, s], [-s, c]]) + (x, y)
 
 
 def _plot_start_outline(scene: Scene, z, ax: Axes) -> None:
