@@ -1,6 +1,7 @@
 """What knows nothing of robots: status, configuration, array helpers, small linear algebra, kept programs, files."""
 
 from wholearm_jax.core.arrays import (
+    array_module,
     as_concrete_array,
     as_device_array,
     as_strong_array,

@@ -1,5 +1,7 @@
 """Arrays: conversion to an array of a given type, rows by a computed index, trees stacked along a leading axis."""
 
+from typing import Any
+
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -46,6 +48,11 @@ def is_traced(*trees) -> bool:
     return any([isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees)])
 
 
+def array_module(*trees) -> Any:
+    """Return `jax.numpy` for trees that are traced, else `numpy`, which compiles no program for each shape."""
+    return jnp if is_traced(trees) else np
+
+
 def take_row(values: Array, index: int | Int[Array, ""]) -> Array:
     """Return `values[index]` for an index known to be in range.
 
@@ -60,8 +67,8 @@ def set_row(rows, index: Int[Array, ""], row):
 
 
 def stack_trees(trees):
-    """Stack trees of one structure along a new leading axis; numbers in NumPy: no program for each count."""
-    xp = jnp if is_traced(*trees) else np
+    """Stack trees of one structure along a new leading axis."""
+    xp = array_module(*trees)
     return jax.tree.map(lambda *leaves: as_device_array(xp.stack(leaves)), *trees)
 
 

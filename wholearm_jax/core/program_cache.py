@@ -37,7 +37,7 @@ PACKAGE_NAME = __name__.partition(".")[0]
 KEYED_PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "optax")
 FILE_HEADER = b"wholearm_jax program, format 1"
 
-DATA_TYPES = (*ARRAY_TYPES, jax.ShapeDtypeStruct)
+DATA_TYPES = (*ARRAY_TYPES, jax.ShapeDtypeStruct)  # arguments that are data, or stand for it
 
 _folder: Path | None = None
 

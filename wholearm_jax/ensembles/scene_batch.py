@@ -6,11 +6,10 @@ from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from wholearm_jax.core import as_device_array, is_traced, stack_trees
+from wholearm_jax.core import array_module, as_device_array, stack_trees
 from wholearm_jax.model import Scene
 
 
@@ -80,7 +79,7 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
 
 def _pad_polygon(scene: Scene, capacity: int) -> Scene:
     """Pad the polygon to `capacity` rows by repeating its last vertex."""
-    xp = jnp if is_traced(scene.object) else np
+    xp = array_module(scene.object)
     vertices = xp.asarray(scene.object.vertices)
     padding = xp.broadcast_to(vertices[-1], (capacity - vertices.shape[0], 2))
     return eqx.tree_at(lambda s: s.object.vertices, scene, xp.concatenate([vertices, padding]))

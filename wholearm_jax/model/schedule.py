@@ -1,13 +1,13 @@
 """Torque schedules: two joint torques over time, linear between rows; a repeated time is a step."""
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core import as_concrete_array, as_device_array, is_traced, take_row
+from wholearm_jax.core import array_module, as_concrete_array, as_device_array, is_traced, take_row
 
 ROW_MULTIPLE = 128  # schedules are padded to a multiple of it, so that similar lengths share compiled programs
 TIME_ROUNDING = 16  # times that differ by this many units of machine epsilon are one
@@ -137,8 +137,7 @@ def round_up(rows: int, multiple: int = ROW_MULTIPLE) -> int:
 
 def pad_schedule(schedule: TorqueSchedule, multiple: int = ROW_MULTIPLE) -> TorqueSchedule:
     """Pad a schedule, or several along leading axes, with rows after its end that repeat the last torque."""
-    # Numbers are padded in NumPy: no program for each shape.
-    xp: Any = jnp if is_traced(schedule) else np
+    xp = array_module(schedule)
     times, values = xp.asarray(schedule.times), xp.asarray(schedule.values)
     missing = round_up(times.shape[-1], multiple) - times.shape[-1]
     ramp = times[..., -1:] + (times[..., -1:] - times[..., :1]) * np.arange(1, missing + 1, dtype=times.dtype)
