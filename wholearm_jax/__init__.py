@@ -33,7 +33,7 @@ from wholearm_jax.optimisation import (
     search_by_steps,
     shortest_motions,
 )
-from wholearm_jax.phases import margin, simulate, trace, trajectory
+from wholearm_jax.phases import margin, simulate, torque_accuracy, trace, trajectory
 from wholearm_jax.planning import plan, plan_with_hand
 from wholearm_jax.simulation import IntegratorOptions
 
@@ -64,6 +64,7 @@ __all__ = [
     "search_by_steps",
     "shortest_motions",
     "simulate",
+    "torque_accuracy",
     "torque_schedule",
     "trace",
     "trajectory",

@@ -20,7 +20,7 @@ from wholearm_jax.files import bundled, write_trajectory
 SCENES = Path(wa.__file__).parent / "scenes"
 TIMES = 2000
 ROUNDING = 1e-8  # [m]
-NEED_A_LAW = {"box"}  # a fingertip takes over from a vertex, where nothing stops the object
+TIMESTEPS = {"box": 1e-4}  # [s]; a fingertip takes over from a vertex, where nothing stops the object
 END_OF_RANGE = {"box": {"finger1 reaches its range"}}  # where the plan itself ends: the finger lies on the palm
 
 
@@ -64,8 +64,7 @@ def test_links_and_object_do_not_overlap(optimum, tmp_path):
 
 def test_executions_end_where_predicted(optimum):
     name, found = optimum
-    law = wa.feedback(found.result.scene, found.torque, friction=0.1) if name in NEED_A_LAW else None
-    done = execute(found.result, timestep=2e-4 if law is None else 4e-4, controller=law)
+    done = execute(found.result, timestep=TIMESTEPS.get(name, 2e-4))
     assert set(done.link_contacts) == END_OF_RANGE.get(name, set())
     assert done.ending.value == "ok"
     assert done.position_error < 5e-5

@@ -46,6 +46,20 @@ def write_result(
         print_json(content)
     else:
         print(result.message if not folder else f"{result.message} -> {folder}")
+        if controller is None:
+            _note_accuracy(content)
+
+
+def _note_accuracy(content: dict) -> None:
+    """Say how exact torques must be, where a motor's usual error is too much, and what helps."""
+    from wholearm_jax.phases import END_ANGLE, END_POSITION, MOTOR_ERROR
+
+    known = [phase["torque_accuracy"] for phase in content["phases"] if phase["torque_accuracy"] is not None]
+    if known and min(known) < MOTOR_ERROR:
+        note(
+            f"open loop, torques must be right to {100 * min(known):.2g} % for an end within {1e3 * END_POSITION:g} mm"
+            f" and {END_ANGLE:g} rad; a law corrects what is wrong: wholearm optimise SCENE --feedback"
+        )
 
 
 def may_replace(folder: Path, files, ok: bool) -> bool:

@@ -14,6 +14,7 @@ from wholearm_jax.core import require_positive
 from wholearm_jax.feedback import Controller, begin, require_same_plan
 from wholearm_jax.feedback import step as law_step
 from wholearm_jax.model import Scene
+from wholearm_jax.phases import MOTOR_ERROR
 
 SETTLING = 0.1  # time for which the controller holds the object after its arrival [s]
 
@@ -27,7 +28,7 @@ class Hardware(NamedTuple):
     rate: float = 1000.0
     delay: float = 1e-3
     counts: int = 4096
-    torque_noise: float = 0.01
+    torque_noise: float = MOTOR_ERROR
 
 
 IDEAL = Hardware(delay=0.0, counts=0, torque_noise=0.0)

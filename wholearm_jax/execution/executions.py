@@ -46,7 +46,7 @@ from wholearm_jax.model import (
     feature_pair,
     rigid_body,
 )
-from wholearm_jax.phases import Result, target_configuration, trajectory
+from wholearm_jax.phases import END_ANGLE, END_POSITION, Result, target_configuration, trajectory
 
 SAMPLES = 2001  # of the prediction, a phase
 
@@ -57,8 +57,8 @@ Motor = Callable[[int, Float[np.ndarray, "2"]], Float[np.ndarray, "2"] | None]
 class Tolerance(NamedTuple):
     """How near the predicted end counts as success: `position` and the last contacts' gaps [m], `angle` [rad]."""
 
-    position: float = 5e-4
-    angle: float = 0.01
+    position: float = END_POSITION
+    angle: float = END_ANGLE
 
 
 class ExecutionOutcome(enum.Enum):

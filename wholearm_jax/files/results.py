@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from wholearm_jax.core import write_atomically
+from wholearm_jax.core import Status, write_atomically
 from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.files.torque_csv import TORQUE_COLUMNS
 from wholearm_jax.model import CONSTRAINTS, COORDINATES, TorqueSchedule
-from wholearm_jax.phases import Result, trajectory
+from wholearm_jax.phases import Result, torque_accuracy, trajectory
 
 _CONTACTS = range(1, CONSTRAINTS + 1)
 TRAJECTORY_COLUMNS = (
@@ -65,6 +65,7 @@ def summary(result: Result, *, bounds: tuple[float, ...] | None = None, **more: 
         bounds: of each phase's margin [N].
         more: further entries, such as the command and its settings.
     """
+    accuracy = torque_accuracy(result) if result.status is Status.OK else [None] * len(result.phases)
     phases = [
         {
             "name": phase.name,
@@ -77,6 +78,7 @@ def summary(result: Result, *, bounds: tuple[float, ...] | None = None, **more: 
             "margin_time": phase.margin_time,
             "margin_contact": phase.margin_contact,
             "bound": None if bounds is None else bounds[k],
+            "torque_accuracy": accuracy[k],
             "holds": [rest._asdict() for rest in phase.holds],
             "message": phase.message,
         }

@@ -29,4 +29,5 @@ from wholearm_jax.margin.statics import (
     contact_statics,
     without_joint,
 )
+from wholearm_jax.margin.strong_stability import moving_mode, must_stay
 from wholearm_jax.margin.upper_bound import BOUND_PLACES, BOUND_SPEEDS, MAX_SPEED_RATIO, MarginBound, margin_upper_bound

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wholearm_jax.margin.statics import Statics
+from wholearm_jax.margin.strong_stability import moving_mode
 from wholearm_jax.model import TorqueSchedule, time_tolerance
 
 FEASIBILITY_TOL = -1e-8  # least margin that counts as possible, over the unit of force: rounding
@@ -22,6 +23,7 @@ class RestInterval(NamedTuple):
     time: float  # of the least margin [s]
     contact: str  # that limits it, or that is lost
     loss_time: float | None  # time from which no forces can hold the object [s]; None: some always can
+    may_move: tuple[str, ...] = ()  # what contacts may do instead, by Coulomb's law; none where the object must stay
 
     @property
     def message(self) -> str:
@@ -29,7 +31,8 @@ class RestInterval(NamedTuple):
         span = f"held at rest from {self.start:.4g} to {self.end:.4g} s"
         if self.loss_time is not None:
             return f"{span}: not possible from t = {self.loss_time:.6g} s, {self.contact} would have to pull"
-        return f"{span}, hold's margin {self.margin:.4g} N at {self.contact}"
+        weak = f"; weakly: by Coulomb's law it may as well move, {', '.join(self.may_move)}" if self.may_move else ""
+        return f"{span}, hold's margin {self.margin:.4g} N at {self.contact}{weak}"
 
 
 def rest_margin(balance: Statics, schedule: TorqueSchedule, start: float, end: float) -> RestInterval:
@@ -40,7 +43,8 @@ def rest_margin(balance: Statics, schedule: TorqueSchedule, start: float, end: f
     floor = FEASIBILITY_TOL * balance.unit
     lost = next((k for k, each in enumerate(margins) if each.margin < floor), None)
     if lost is None:
-        return RestInterval(start, end, margins[worst].margin, times[worst], margins[worst].contact, None)
+        least, may_move = margins[worst], moving_mode(balance, np.array(torques[:-1]))  # at the end it may start
+        return RestInterval(start, end, least.margin, times[worst], least.contact, None, may_move)
     before = max(lost - 1, 0)
     fraction = balance.loss_fraction(torques[before], torques[lost]) if lost > 0 else 1.0
     loss_time = times[before] + fraction * (times[lost] - times[before])

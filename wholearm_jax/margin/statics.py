@@ -71,6 +71,7 @@ class Statics:
     dry: Float[np.ndarray, "2"]  # largest dry friction of the joints
     torque_limit: Float[np.ndarray, "2"]  # [N m]
     unit: float  # [N]
+    mass: Float[np.ndarray, "5"]  # diagonal of the mass matrix, over `unit`; accelerations are in object radii
 
     def margin_under(self, torque) -> StaticMargin:
         """Compute the margin under a given torque [N m]."""
@@ -190,6 +191,7 @@ def contact_statics(scene: Scene, formation: ContactFormation, z: Float[Array | 
         dry=np.asarray(mechanics.dry) * force / unit,
         torque_limit=np.asarray(mechanics.torque_limit),
         unit=unit,
+        mass=np.asarray(mechanics.inertia) * force / unit,
     )
 
 

@@ -1,7 +1,9 @@
 """Where the descent starts: the convex optimum of a phase, and how long the object should move.
 
 A phase that may take much longer than its optimum needs moves for a part of its duration only, and waits before, held
-by friction, where the contacts hold the object at rest with no smaller margin than in motion.
+by friction, where the object must stay (`strong_hold`) and the contacts hold it with no smaller margin than in motion.
+Where they hold it with less, that is tried if the whole duration is too much: small errors grow exponentially in the
+time of a motion.
 
 Derivation: section 8 of `docs/derivation.md`.
 """
@@ -17,7 +19,8 @@ from wholearm_jax.model import Phase, Scene, TorqueSchedule, concatenate_schedul
 from wholearm_jax.optimisation.best_motion import largest_margin, shortest_duration
 from wholearm_jax.optimisation.initial_guess import UnitMotion
 from wholearm_jax.optimisation.quasistatic_plan import rolling_count
-from wholearm_jax.phases import HandOver, TracedPhase, statics_at_start
+from wholearm_jax.optimisation.strong_hold import strong_hold
+from wholearm_jax.phases import HandOver, TracedPhase
 
 NEAR_MARGIN = 0.999  # fraction of the largest margin that the shortest sensible motion reaches
 GOOD_MOVING_TIME = 1.25  # time of a motion after a wait, over the shortest sensible one
@@ -29,6 +32,7 @@ class Wait(NamedTuple):
 
     time: float  # [s]
     torque: Float[np.ndarray, "2"]  # [N m]
+    margin: float  # of the contacts that hold it [N]
 
 
 class ConvexStart(NamedTuple):
@@ -60,7 +64,7 @@ def convex_starts(
 
     Returns:
         The starts to try in turn: moving for the whole duration unless that is very long, then after a wait where there
-        is time and that costs no margin. None where no motion from rest to rest takes so little time.
+        is time and the object can be held. None where no motion from rest to rest takes so little time.
     """
     rest, dynamics, rolling = rest_to_rest(), traced.dynamics, rolling_count(phase)
 
@@ -78,16 +82,13 @@ def convex_starts(
     moving = GOOD_MOVING_TIME * float(sensible.duration)
     if not bool(sensible.converged) or duration <= moving:
         return starts
-    if hand_over is None:
-        statics, accelerations = statics_at_start(scene, phase, traced)
-        hold = statics.most_central_torque(accelerations)
-    else:
-        hold = hand_over.best_hold()
-    if not hold.margin >= float(whole.margin):
+    hold = strong_hold(scene, phase, traced, hand_over)
+    if hold is None:
         return starts
-    waiting = ConvexStart(_unit_motion(optimum(moving), traced, knots), Wait(duration - moving, hold.torque))
+    wait = Wait(duration - moving, hold.torque, hold.margin)
+    waiting = ConvexStart(_unit_motion(optimum(moving), traced, knots), wait)
     is_long = duration > MAX_MOVING_TIME * float(sensible.duration)
-    return [waiting] if is_long else [*starts, waiting]
+    return [waiting] if is_long and hold.margin >= float(whole.margin) else [*starts, waiting]
 
 
 def wait_before(wait: Wait, schedule: TorqueSchedule) -> TorqueSchedule:

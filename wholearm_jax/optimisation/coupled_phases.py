@@ -30,7 +30,7 @@ from wholearm_jax.model import (
     uniform_schedule,
 )
 from wholearm_jax.optimisation.constraints import Limits
-from wholearm_jax.optimisation.convex_start import ConvexStart, wait_before
+from wholearm_jax.optimisation.convex_start import ConvexStart, Wait, wait_before
 from wholearm_jax.optimisation.initial_guess import initial_guesses
 from wholearm_jax.optimisation.interior_point import interior_point
 from wholearm_jax.optimisation.multiple_shooting import extra_parts
@@ -38,12 +38,28 @@ from wholearm_jax.optimisation.projected_gradient import projected_gradient
 from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.optimisation.solver import CONVERGED, REPEATED, IterationRecord, Problem, solve
 from wholearm_jax.optimisation.variables import Variables
-from wholearm_jax.phases import HandOver, TracedPhase, rest_intervals, simulate_phase
+from wholearm_jax.phases import (
+    HandOver,
+    SimulatedPhase,
+    TracedPhase,
+    required_accuracy,
+    rest_intervals,
+    simulate_phase,
+)
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
 GUESS_TORQUE_FRACTION = 0.9  # of the torque limits, that an initial guess may use
 MIN_DURATION_FRACTION = 0.01  # of its longest duration, that a phase takes at least
 GOOD_BOUND_FRACTION = 0.99  # of the bound, with which no further guess is tried
+FOLLOWABLE_ACCURACY = 1e-4  # of torques; no motor follows a schedule that needs a higher one, and friction is unknown
+
+
+class SolutionQuality(NamedTuple):
+    """How good a solution is, as its simulation has it; the largest is the best."""
+
+    is_ok: bool
+    is_followable: bool  # whether torques may be as wrong as `FOLLOWABLE_ACCURACY`
+    bound_fraction: float  # least margin over its bound, that of a wait before the motion included
 
 
 class GroupSolution(NamedTuple):
@@ -52,7 +68,7 @@ class GroupSolution(NamedTuple):
     schedules: list[TorqueSchedule]  # of each phase, from time 0
     reason: str  # why iterations ended
     history: list[IterationRecord]
-    score: tuple[bool, float] = (False, -np.inf)  # whether the simulation is `ok`, and its least margin over its bound
+    score: SolutionQuality = SolutionQuality(False, False, -np.inf)
     knots: int = 2  # of each phase
 
 
@@ -110,11 +126,15 @@ class CoupledPhases:
         return min([1.0, *(end.margin_fraction for end in ends)])
 
     @property
+    def waits(self) -> tuple[Wait, ...]:
+        """The wait before the first phase's motion; empty without."""
+        return () if self.convex is None or self.convex.wait is None else (self.convex.wait,)
+
+    @property
     def dwell_times(self) -> np.ndarray:
         """How long the object waits in each phase before it starts [s]."""
         first = self.begin.dwell_time if self.begin is not None else 0.0
-        if self.convex is not None and self.convex.wait is not None:
-            first += self.convex.wait.time
+        first += sum(wait.time for wait in self.waits)
         return np.append(first, np.zeros(len(self.phases) - 1))
 
     @property
@@ -161,7 +181,9 @@ def solve_coupled_phases(scene: Scene, group: CoupledPhases) -> GroupSolution:
     reason = f"within {options.tolerance:g} of the bound" if near_bound else best.reason
     # Where iterations end without torques, the phase is simulated under those of its first guess, which are in limits.
     found = best.p if np.isfinite(np.asarray(best.p.torque)).all() else guesses[0]
-    return GroupSolution(_schedules(group, found), reason, history, best[:2], options.knots)
+    fraction = min(best.bound_fraction, *(wait.margin / group.bounds[0] for wait in group.waits), np.inf)
+    score = SolutionQuality(best.is_ok, best.is_ok and _is_followable(group, best.p), fraction)
+    return GroupSolution(_schedules(group, found), reason, history, score, options.knots)
 
 
 class _Candidate(NamedTuple):
@@ -217,25 +239,17 @@ def _schedules(group: CoupledPhases, p: Variables) -> list[TorqueSchedule]:
     if group.begin is not None and group.begin.dwell_time > 0:
         times = np.append(0.0, group.begin.dwell_time + np.asarray(first.times))
         first = TorqueSchedule(as_device_array(times), as_device_array(np.vstack([group.begin.torque, first.values])))
-    if group.convex is not None and group.convex.wait is not None:
-        first = wait_before(group.convex.wait, first)
+    for wait in group.waits:
+        first = wait_before(wait, first)
     return [first, *others]
 
 
 def _verify_by_simulation(scene: Scene, group: CoupledPhases, p: Variables) -> tuple[bool, float]:
     """Simulate the schedules: whether all phases are `ok`, rests included, and the least margin over its bound."""
-    start, fractions, is_ok, incoming_velocity, hand_over = 0.0, [], [], None, group.hand_over
+    fractions, is_ok, hand_over = [], [], group.hand_over
     torque = concatenate_schedules(_schedules(group, p))
-    schedule = pad_schedule(torque, group.options.schedule_rows)
-    options = with_step_capacity(IntegratorOptions(), group.options.knots)
-    ends = np.cumsum(np.exp(np.asarray(p.log_duration)) + group.dwell_times)
-    for phase, path, end, bound in zip(group.phases, group.traced, ends, group.bounds, strict=True):
-        simulated = simulate_phase(
-            path.dynamics, schedule, start, end - start, options, phase.arrive, incoming_velocity
-        )
-        motion = simulated.motion
-        start += float(simulated.duration) * float(np.asarray(motion.phase_time)[int(motion.count)])
-        incoming_velocity = simulated.exit_velocity if phase.arrive is Arrival.MOVING else None
+    simulated_phases = _simulate_group(group, p, torque)
+    for phase, path, simulated, bound in zip(group.phases, group.traced, simulated_phases, group.bounds, strict=True):
         rests = rest_intervals(scene, torque, phase, path, simulated, hand_over)
         hand_over = None
         stays = all(rest.loss_time is None for rest in rests)
@@ -243,6 +257,30 @@ def _verify_by_simulation(scene: Scene, group: CoupledPhases, p: Variables) -> t
         fractions.append(float(simulated.margin_result.margin) / bound)
     least = min(fractions)
     return all(is_ok), least if np.isfinite(least) else -np.inf
+
+
+def _simulate_group(group: CoupledPhases, p: Variables, torque: TorqueSchedule) -> list[SimulatedPhase]:
+    """Simulate the phases of a group, from time 0, under a schedule with the durations of `p`."""
+    start, incoming_velocity, simulated_phases = 0.0, None, []
+    schedule = pad_schedule(torque, group.options.schedule_rows)
+    options = with_step_capacity(IntegratorOptions(), group.options.knots)
+    ends = np.cumsum(np.exp(np.asarray(p.log_duration)) + group.dwell_times)
+    for phase, path, end in zip(group.phases, group.traced, ends, strict=True):
+        simulated = simulate_phase(
+            path.dynamics, schedule, start, end - start, options, phase.arrive, incoming_velocity
+        )
+        motion = simulated.motion
+        start += float(simulated.duration) * float(np.asarray(motion.phase_time)[int(motion.count)])
+        incoming_velocity = simulated.exit_velocity if phase.arrive is Arrival.MOVING else None
+        simulated_phases.append(simulated)
+    return simulated_phases
+
+
+def _is_followable(group: CoupledPhases, p: Variables) -> bool:
+    """Whether torques that are a little wrong bring the object to where it should end."""
+    torque = concatenate_schedules(_schedules(group, p))
+    accuracy = required_accuracy(lambda changed: _simulate_group(group, p, changed), torque, group.traced)
+    return bool(np.all(accuracy >= FOLLOWABLE_ACCURACY))
 
 
 def _limits(group: CoupledPhases) -> Limits:

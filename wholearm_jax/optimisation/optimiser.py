@@ -6,7 +6,8 @@ How its modules work together:
    those that follow one another at speed are one problem. Where torque rates are limited, linear programmes first fix
    the torques between problems (`rest_transition`, `plan_transitions`). A phase that holds the object needs no more.
 2. *Initial guesses* (`convex_start`, `initial_guess`): the motion of the convex optimum, with the best quasi-static
-   torques, and a smooth one. An object with much more time than it needs waits first, held by friction.
+   torques, and a smooth one. An object with much more time than it needs waits first, held by friction; one with more
+   time than it needs does so where a motion that takes all of it would need torques that no motor is as exact as.
 3. *Multiple shooting* (`variables`, `multiple_shooting`). The variables `p` are the torques and states at the knots and
    the durations. Each interval between two knots is simulated from its own state; that it ends in the state at the next
    knot is an equation `e(p) = 0`. Instability of the motion thus cannot grow beyond one interval.
@@ -294,11 +295,11 @@ def _solve_group(
         for convex in starts or [None]:
             problem = coupled(convex, len(starts) <= 1, len(solutions), finer)
             solutions.append(solve_coupled_phases(scene, problem))
-            if solutions[-1].score >= (True, 1 - options.tolerance):
+            if solutions[-1].score >= (True, True, 1 - options.tolerance):
                 break
-        best = max(solutions, key=lambda found: found.score)
-        if best.score >= (True, GOOD_BOUND_FRACTION):
+        if any(found.score.is_ok and found.score.bound_fraction >= GOOD_BOUND_FRACTION for found in solutions):
             break
+    best = max(solutions, key=lambda found: found.score)
     return best._replace(history=[record for found in solutions for record in found.history])
 
 

@@ -55,3 +55,4 @@ from wholearm_jax.phases.rest_certificate import certify_rest
 from wholearm_jax.phases.result import PhaseResult, Result, build_result, rest_intervals
 from wholearm_jax.phases.sampling import DEFAULT_SAMPLES, Trajectory, by_contact, sample_phase, trajectory
 from wholearm_jax.phases.standing_fingers import idle_torques
+from wholearm_jax.phases.torque_accuracy import END_ANGLE, END_POSITION, MOTOR_ERROR, required_accuracy, torque_accuracy
