@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -188,7 +189,7 @@ def stop_early(data):
     [
         (spread, "phase[0].contacts", "finger2:v3", "from this start"),
         (shorten, "phase[0].contacts", "finger1:v1", "a gap of 0.0504 m stays open"),
-        (overload, "phase[0].contacts", "palm:v", "from this start"),  # any of three vertices on a flat palm
+        (overload, "phase[0].contacts", "", "from this start"),  # any of the four: no pose closes all gaps
         (skip, "phase[1].contacts", "finger1:v0", "where phase 'slide left' ends"),
         (stop_early, "phase[1].contacts", "finger2:v4", "where phase 'slide left' ends"),
     ],
@@ -265,6 +266,17 @@ def test_path_that_cannot_be_followed(wholearm, zero, scene_file, tmp_path):
     assert err == ""
     assert printed.startswith("slide left: singular")
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["margin"] is None
+
+
+def test_how_exact_torques_must_be_is_said(wholearm, tmp_path):
+    """In a note where a motor's error is too much, and in the summary of each phase."""
+    torque = Path(__file__).parents[1] / "data" / "heptagon_torque.csv"
+    code, _, err = wholearm("simulate", layered_file("heptagon"), "--torque", torque, "--out", tmp_path, "--samples", 5)
+    assert code == 0
+    phases = json.loads((tmp_path / "summary.json").read_text())["phases"]
+    least = min(phase["torque_accuracy"] for phase in phases)
+    assert 1e-4 < least < 1e-2
+    assert f"torques must be right to {100 * least:.2g} % for an end within 0.5 mm and 0.01 rad" in err
 
 
 # --- what may not be meant -------------------------------------------------------------------------------------------

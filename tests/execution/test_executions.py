@@ -562,6 +562,18 @@ def test_the_table_of_an_execution(executions, tmp_path):
         np.testing.assert_array_equal(dynamics[f"cn {name}"], done.course.cn[at, done.names.index(name)])
 
 
+def test_who_goes_astray_open_loop_is_told_what_helps(wholearm, tmp_path):
+    rows = [line.split(",") for line in Path(TORQUE[1]).read_text().splitlines()]
+    wrong = [rows[0], *([t, f"{0.96 * float(one)}", f"{0.96 * float(two)}"] for t, one, two in rows[1:])]
+    (tmp_path / "wrong.csv").write_text("\n".join(",".join(row) for row in wrong))
+    options = "--torque", tmp_path / "wrong.csv", "--timestep", 8e-4
+    code, out, err = wholearm("execute", layered_file("heptagon"), *options)
+    assert code == 1
+    assert "executed: astray" in out
+    assert "open loop nothing corrects the object" in err
+    assert "wholearm optimise SCENE --feedback" in err
+
+
 @pytest.mark.parametrize(
     ("more", "cause"),
     [
