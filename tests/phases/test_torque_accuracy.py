@@ -78,6 +78,16 @@ def test_an_object_with_time_to_spare_waits_before_a_slide_that_no_motor_could_f
         assert not wait.may_move
 
 
+def test_an_object_that_rubs_little_moves_faster_yet(arrow):
+    """Its motion of 99.9 % of the largest margin needs torques right to 2e-5, also after a wait; that of 99 % less."""
+    scene, _ = arrow
+    slippery = eqx.tree_at(lambda s: s.object.friction, scene, np.full(3, 0.05))
+    found = optimised_at((slippery, wa.trace(slippery)), (4.0, 4.0))
+    assert found.result.status is wa.Status.OK
+    assert min(found.bound_fraction) > 0.98
+    assert min(wa.torque_accuracy(found.result)) >= FOLLOWABLE_ACCURACY
+
+
 def test_a_slide_that_motors_can_follow_takes_all_its_time(arrow):
     found = optimised_at(arrow, (0.25, 0.25))
     assert not any(phase.holds for phase in found.result.phases)

@@ -188,6 +188,9 @@ def _print_optimised(optimum) -> None:
         ok = phase.status.value == 0 and 0 < fraction < float("inf")  # a failed plan may not come to the hard part
         reached = f", {100 * fraction:.1f} % of it reached" if ok else ""
         print(f"{phase.message}; bound {float(bound.value):.4g} N{reached}; stopped: {reason}")
+        for rest in phase.holds:
+            if rest.may_move:
+                print(f"    {rest.message}")
 
 
 def _optimise_ensemble(

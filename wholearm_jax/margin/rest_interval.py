@@ -35,15 +35,21 @@ class RestInterval(NamedTuple):
         return f"{span}, hold's margin {self.margin:.4g} N at {self.contact}{weak}"
 
 
-def rest_margin(balance: Statics, schedule: TorqueSchedule, start: float, end: float) -> RestInterval:
-    """Compute the margin of an object at rest from `start` to `end` [s] under a schedule, exactly."""
+def rest_margin(
+    balance: Statics, schedule: TorqueSchedule, start: float, end: float, *, judge_stability: bool = True
+) -> RestInterval:
+    """Compute the margin of an object at rest from `start` to `end` [s] under a schedule, exactly.
+
+    `judge_stability` says whether to find out what else the contacts may do.
+    """
     times, torques = schedule_corners(schedule, start, end)
     margins = [balance.margin_under(torque) for torque in torques]
     worst = int(np.argmin([each.margin for each in margins]))
     floor = FEASIBILITY_TOL * balance.unit
     lost = next((k for k, each in enumerate(margins) if each.margin < floor), None)
     if lost is None:
-        least, may_move = margins[worst], moving_mode(balance, np.array(torques[:-1]))  # at the end it may start
+        may_move = moving_mode(balance, np.array(torques[:-1])) if judge_stability else ()  # at the end it may start
+        least = margins[worst]
         return RestInterval(start, end, least.margin, times[worst], least.contact, None, may_move)
     before = max(lost - 1, 0)
     fraction = balance.loss_fraction(torques[before], torques[lost]) if lost > 0 else 1.0

@@ -23,6 +23,7 @@ from wholearm_jax.optimisation.strong_hold import strong_hold
 from wholearm_jax.phases import HandOver, TracedPhase
 
 NEAR_MARGIN = 0.999  # fraction of the largest margin that the shortest sensible motion reaches
+HURRIED_MARGIN = 0.99  # the same of a hurried one, which has less time for errors to grow
 GOOD_MOVING_TIME = 1.25  # time of a motion after a wait, over the shortest sensible one
 MAX_MOVING_TIME = 6.0  # longest motion without a wait, over the shortest sensible one; knots resolve no longer one
 
@@ -33,6 +34,7 @@ class Wait(NamedTuple):
     time: float  # [s]
     torque: Float[np.ndarray, "2"]  # [N m]
     margin: float  # of the contacts that hold it [N]
+    is_strong: bool  # whether it must stay (`strong_hold`)
 
 
 class ConvexStart(NamedTuple):
@@ -42,53 +44,71 @@ class ConvexStart(NamedTuple):
     wait: Wait | None  # None: the object moves at once
 
 
-def convex_starts(
-    scene: Scene,
-    phase: Phase,
-    traced: TracedPhase,
-    duration: float,
-    knots: int,
-    may_wait: bool,
-    hand_over: HandOver | None = None,
-) -> list[ConvexStart]:
+class StartOptions(NamedTuple):
+    """What the starts of one phase are found for."""
+
+    scene: Scene
+    phase: Phase
+    traced: TracedPhase
+    duration: float  # of the phase [s]
+    knots: int  # of its torque
+    hand_over: HandOver | None  # with which it begins, if it does: either contact must hold an object that waits
+
+    def optimum(self, time: float) -> PathOptimum:
+        """The motion of so much time with the largest margin."""
+        rolling = rolling_count(self.phase)
+        return largest_margin(self.traced.dynamics, as_device_array(time), rest_to_rest(), rolling)
+
+    def start(self, optimum: PathOptimum, wait: Wait | None) -> ConvexStart:
+        """A motion, after a wait or not."""
+        return ConvexStart(_unit_motion(optimum, self.traced, self.knots), wait)
+
+
+def convex_starts(options: StartOptions, may_wait: bool) -> list[ConvexStart]:
     """Solve the convex programme of one phase from rest to rest.
 
     Args:
-        scene: the plan.
-        phase: one of its phases.
-        traced: its path.
-        duration: of the phase [s].
-        knots: torque knots of the phase.
+        options: of the phase.
         may_wait: whether the object may wait before it moves.
-        hand_over: with which the phase begins, if it does: either contact must hold an object that waits.
 
     Returns:
         The starts to try in turn: moving for the whole duration unless that is very long, then after a wait where there
         is time and the object can be held. None where no motion from rest to rest takes so little time.
     """
-    rest, dynamics, rolling = rest_to_rest(), traced.dynamics, rolling_count(phase)
-
-    def optimum(time: float) -> PathOptimum:
-        return largest_margin(dynamics, as_device_array(time), rest, rolling)
-
-    whole = optimum(duration)
+    whole = options.optimum(options.duration)
     if not bool(whole.converged):
         return []
-    starts = [ConvexStart(_unit_motion(whole, traced, knots), None)]
-    if not may_wait:
+    starts = [options.start(whole, None)]
+    sensible = _shortest_time(options, NEAR_MARGIN * float(whole.margin)) if may_wait else np.inf
+    waiting = _after_wait(options, GOOD_MOVING_TIME * sensible)
+    if waiting is None or waiting.wait is None:
         return starts
-    near = as_device_array(NEAR_MARGIN * float(whole.margin))
-    sensible = shortest_duration(dynamics, near, rest, rolling)
-    moving = GOOD_MOVING_TIME * float(sensible.duration)
-    if not bool(sensible.converged) or duration <= moving:
-        return starts
-    hold = strong_hold(scene, phase, traced, hand_over)
+    is_long = options.duration > MAX_MOVING_TIME * sensible
+    return [waiting] if is_long and waiting.wait.margin >= float(whole.margin) else [*starts, waiting]
+
+
+def hurried_start(options: StartOptions) -> ConvexStart | None:
+    """Return the start with a wait and a shorter motion yet, for a phase whose other motions need too exact torques."""
+    whole = options.optimum(options.duration)
+    return _after_wait(options, _shortest_time(options, HURRIED_MARGIN * float(whole.margin)))
+
+
+def _shortest_time(options: StartOptions, margin: float) -> float:
+    """The shortest time of a motion with a margin [N], in seconds; infinite where none was found."""
+    rolling = rolling_count(options.phase)
+    found = shortest_duration(options.traced.dynamics, as_device_array(margin), rest_to_rest(), rolling)
+    return float(found.duration) if bool(found.converged) else np.inf
+
+
+def _after_wait(options: StartOptions, moving: float) -> ConvexStart | None:
+    """A motion of so much time after a wait; None where there is no time for that, or nothing holds the object."""
+    if options.duration <= moving:
+        return None
+    hold = strong_hold(options.scene, options.phase, options.traced, options.hand_over)
     if hold is None:
-        return starts
-    wait = Wait(duration - moving, hold.torque, hold.margin)
-    waiting = ConvexStart(_unit_motion(optimum(moving), traced, knots), wait)
-    is_long = duration > MAX_MOVING_TIME * float(sensible.duration)
-    return [waiting] if is_long and hold.margin >= float(whole.margin) else [*starts, waiting]
+        return None
+    wait = Wait(options.duration - moving, hold.static.torque, hold.static.margin, hold.is_strong)
+    return options.start(options.optimum(moving), wait)
 
 
 def wait_before(wait: Wait, schedule: TorqueSchedule) -> TorqueSchedule:

@@ -58,7 +58,7 @@ class SolutionQuality(NamedTuple):
     """How good a solution is, as its simulation has it; the largest is the best."""
 
     is_ok: bool
-    is_followable: bool  # whether torques may be as wrong as `FOLLOWABLE_ACCURACY`
+    is_followable: bool  # whether torques may be as wrong as `FOLLOWABLE_ACCURACY`, and an object that waits must stay
     bound_fraction: float  # least margin over its bound, that of a wait before the motion included
 
 
@@ -250,7 +250,7 @@ def _verify_by_simulation(scene: Scene, group: CoupledPhases, p: Variables) -> t
     torque = concatenate_schedules(_schedules(group, p))
     simulated_phases = _simulate_group(group, p, torque)
     for phase, path, simulated, bound in zip(group.phases, group.traced, simulated_phases, group.bounds, strict=True):
-        rests = rest_intervals(scene, torque, phase, path, simulated, hand_over)
+        rests = rest_intervals(scene, torque, phase, path, simulated, hand_over, judge_stability=False)
         hand_over = None
         stays = all(rest.loss_time is None for rest in rests)
         is_ok.append(int(simulated.assessment.status) == Status.OK and stays)
@@ -277,10 +277,10 @@ def _simulate_group(group: CoupledPhases, p: Variables, torque: TorqueSchedule) 
 
 
 def _is_followable(group: CoupledPhases, p: Variables) -> bool:
-    """Whether torques that are a little wrong bring the object to where it should end."""
+    """Whether torques that are a little wrong bring the object to where it should end, and it stays where it waits."""
     torque = concatenate_schedules(_schedules(group, p))
     accuracy = required_accuracy(lambda changed: _simulate_group(group, p, changed), torque, group.traced)
-    return bool(np.all(accuracy >= FOLLOWABLE_ACCURACY))
+    return bool(np.all(accuracy >= FOLLOWABLE_ACCURACY)) and all(wait.is_strong for wait in group.waits)
 
 
 def _limits(group: CoupledPhases) -> Limits:

@@ -58,7 +58,7 @@ from wholearm_jax.model import (
 )
 from wholearm_jax.optimisation.advice import Search, explain
 from wholearm_jax.optimisation.best_motion import convex_bounds
-from wholearm_jax.optimisation.convex_start import convex_starts
+from wholearm_jax.optimisation.convex_start import StartOptions, convex_starts, hurried_start
 from wholearm_jax.optimisation.coupled_phases import (
     GOOD_BOUND_FRACTION,
     MIN_DURATION_FRACTION,
@@ -291,12 +291,17 @@ def _solve_group(
     moving = float(phases[0].duration) - (ends[0].dwell_time if ends[0] is not None else 0.0)
     solutions: list[GroupSolution] = []
     for finer in options.refinements():
-        starts = convex_starts(scene, phases[0], paths[0], moving, finer.knots, may_wait, hand_over)
+        about = StartOptions(scene, phases[0], paths[0], moving, finer.knots, hand_over)
+        starts = convex_starts(about, may_wait)
         for convex in starts or [None]:
             problem = coupled(convex, len(starts) <= 1, len(solutions), finer)
             solutions.append(solve_coupled_phases(scene, problem))
             if solutions[-1].score >= (True, True, 1 - options.tolerance):
                 break
+        if may_wait and starts and not any(found.score.is_followable for found in solutions):
+            hurried = hurried_start(about)
+            if hurried is not None:
+                solutions.append(solve_coupled_phases(scene, coupled(hurried, False, len(solutions), finer)))
         if any(found.score.is_ok and found.score.bound_fraction >= GOOD_BOUND_FRACTION for found in solutions):
             break
     best = max(solutions, key=lambda found: found.score)

@@ -7,6 +7,7 @@ edges included.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,8 +23,18 @@ EDGE_FRACTIONS = (0.0, 0.2, 0.4, 0.6, 0.8)  # of the way from its middle to ther
 Balance = tuple[Statics, RestAccelerations]
 
 
-def strong_hold(scene: Scene, phase: Phase, traced: TracedPhase, hand_over: HandOver | None) -> StaticMargin | None:
-    """Return a torque that holds the object at a phase's start, by either contact of a hand-over; None: none does."""
+class StrongHold(NamedTuple):
+    """A torque that holds an object at rest."""
+
+    static: StaticMargin
+    is_strong: bool  # whether the object must stay
+
+
+def strong_hold(scene: Scene, phase: Phase, traced: TracedPhase, hand_over: HandOver | None) -> StrongHold | None:
+    """Return a torque that holds the object at a phase's start, by either contact of a hand-over; None: none does.
+
+    It is one under which the object must stay, or that with the largest margin if there is none.
+    """
     if hand_over is None:
         balances: list[Balance] = [statics_at_start(scene, phase, traced)]
         best = balances[0][0].most_central_torque(balances[0][1])
@@ -32,7 +43,10 @@ def strong_hold(scene: Scene, phase: Phase, traced: TracedPhase, hand_over: Hand
         best = hand_over.best_hold()
     if not best.margin > 0:
         return None
-    return best if _must_stay(balances, best.torque[None]).all() else _farthest_from_others(balances)
+    if _must_stay(balances, best.torque[None]).all():
+        return StrongHold(best, is_strong=True)
+    strong = _farthest_from_others(balances)
+    return StrongHold(strong or best, is_strong=strong is not None)
 
 
 def _must_stay(balances: Sequence[Balance], torques: Float[np.ndarray, "torques 2"]) -> Bool[np.ndarray, "torques"]:

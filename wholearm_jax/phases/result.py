@@ -195,10 +195,13 @@ def rest_intervals(
     traced: TracedPhase,
     outcome: SimulatedPhase,
     hand_over: HandOver | None = None,
+    *,
+    judge_stability: bool = True,
 ) -> tuple[RestInterval, ...]:
     """Every time that friction holds the object at rest in a phase: waiting to start, or stopped on the way.
 
-    Where the phase begins with a hand-over, the contacts are those that hold the object less well.
+    Where the phase begins with a hand-over, the contacts are those that hold the object less well. `judge_stability`
+    says whether to find out what else they may do (`RestInterval.may_move`).
     """
     motion = jax.device_get(outcome.motion)
     if int(traced.dynamics.status) != Status.OK:
@@ -213,8 +216,9 @@ def rest_intervals(
         balances = [contact_statics(scene, phase.formation, z)]
         if hand_over is not None and k == 0:
             balances.append(hand_over.before.statics)
-        rests = [rest_margin(balance, torque, begin, end) for balance in balances]
-        found.append(min(rests, key=lambda rest: rest.margin))
+        rests = [rest_margin(one, torque, begin, end, judge_stability=judge_stability) for one in balances]
+        may_move = next((rest.may_move for rest in rests if rest.may_move), ())
+        found.append(min(rests, key=lambda rest: rest.margin)._replace(may_move=may_move))
     return tuple(found)
 
 
