@@ -17,6 +17,7 @@ from wholearm_jax.optimisation.rest_transition import (
     RestTransition,
     rest_transition,
 )
+from wholearm_jax.optimisation.strong_hold import strong_hold
 from wholearm_jax.phases import TracedPhase, statics_at_start
 
 
@@ -84,7 +85,7 @@ def holding_schedule(
     begin: RestTransition | None = None,
     end: RestTransition | None = None,
 ) -> TorqueSchedule:
-    """Return the schedule of the best torque that holds the object, from time 0.
+    """Return the schedule of the best torque that holds the object, from time 0: one under which it must stay, if any.
 
     At a limited rate torques change linearly from that of the first transition to the best one, or as near to it as
     time allows, and on to that of the second. The margin is concave in the torque: it is least where a change ends.
@@ -101,8 +102,12 @@ def holding_schedule(
     duration = float(phase.duration)
     if int(traced.dynamics.status) != Status.OK:
         return uniform_schedule(duration, np.zeros((knots, 2)))
-    statics, accelerations = statics_at_start(scene, phase, traced)
-    best = statics.most_central_torque(accelerations).torque
+    hold = strong_hold(scene, phase, traced, hand_over=None)
+    if hold is None:
+        statics, accelerations = statics_at_start(scene, phase, traced)
+        best = statics.most_central_torque(accelerations).torque
+    else:
+        best = hold.static.torque
     if rate_limit is None:
         return uniform_schedule(duration, np.tile(best, (knots, 1)))
     first, last = (at.torque if at is not None and at.is_feasible else best for at in (begin, end))
