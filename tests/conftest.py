@@ -1,4 +1,4 @@
-"""Every test computes in 64 bits, compiles quickly, and leaves room for those that follow."""
+"""Every test computes in 64 bits, compiles as the command line does, and leaves room for those that follow."""
 
 import gc
 import os
@@ -13,9 +13,6 @@ from wholearm_jax.core.config import configure
 
 MAPPED = 30_000  # half of the memory areas that Linux grants a process by default
 
-# LLVM optimises nothing, in what tests start as well: it compiles in 0.6 of the time, and tests compute little.
-if "--xla_backend_optimization_level" not in os.environ.get("XLA_FLAGS", ""):
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
 configure()
 gc.set_threshold(100_000, 20, 20)
 

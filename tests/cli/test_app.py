@@ -189,7 +189,7 @@ def stop_early(data):
     [
         (spread, "phase[0].contacts", "finger2:v3", "from this start"),
         (shorten, "phase[0].contacts", "finger1:v1", "a gap of 0.0504 m stays open"),
-        (overload, "phase[0].contacts", "", "from this start"),  # any of the four: no pose closes all gaps
+        (overload, "phase[0].contacts", "palm:v", "from this start"),  # any of three vertices on a flat palm
         (skip, "phase[1].contacts", "finger1:v0", "where phase 'slide left' ends"),
         (stop_early, "phase[1].contacts", "finger2:v4", "where phase 'slide left' ends"),
     ],

@@ -203,7 +203,7 @@ def test_bounds_keep_value_and_gradient(scene):
 
 def test_quasistatic_torques_keep_their_values(scene, torque):
     inside = jax.jit(lambda x: x * wa.quasistatic(scene, knots=KNOTS).values)(1.0)
-    np.testing.assert_allclose(inside, torque.values, rtol=1e-13)
+    np.testing.assert_array_equal(inside, torque.values)
     traced = jax.jit(lambda mass: wa.quasistatic(with_mass(scene, mass), knots=KNOTS))(scene.object.mass)
     np.testing.assert_allclose(traced.values, torque.values, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(traced.times, torque.times, rtol=1e-12)
