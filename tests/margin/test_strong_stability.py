@@ -33,7 +33,7 @@ def may_move(statics, torque) -> bool:
     unit = np.eye(5 + 2 * n + 2)
     for contacts in itertools.product(("open", "stick", "+", "-"), repeat=n):
         for turning in itertools.product((0, 1, -1), repeat=2):
-            equal, below, speed = [*np.hstack([newton])], [], np.zeros(len(unit))
+            equal, below, speed = [*newton], [], np.zeros(len(unit))
             for k, mode in enumerate(contacts):
                 parting, slip = (np.append(row[:, k], np.zeros(2 * n + 2)) for row in (normal, tangent))
                 c_n, c_t = unit[5 + k], unit[5 + n + k]

@@ -105,7 +105,7 @@ def _after_wait(options: StartOptions, moving: float) -> ConvexStart | None:
     if options.duration <= moving:
         return None
     hold = strong_hold(options.scene, options.phase, options.traced, options.hand_over)
-    if hold is None:
+    if not hold.static.margin > 0:
         return None
     wait = Wait(options.duration - moving, hold.static.torque, hold.static.margin, hold.is_strong)
     return options.start(options.optimum(moving), wait)

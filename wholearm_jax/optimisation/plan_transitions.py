@@ -102,12 +102,7 @@ def holding_schedule(
     duration = float(phase.duration)
     if int(traced.dynamics.status) != Status.OK:
         return uniform_schedule(duration, np.zeros((knots, 2)))
-    hold = strong_hold(scene, phase, traced, hand_over=None)
-    if hold is None:
-        statics, accelerations = statics_at_start(scene, phase, traced)
-        best = statics.most_central_torque(accelerations).torque
-    else:
-        best = hold.static.torque
+    best = strong_hold(scene, phase, traced, hand_over=None).static.torque
     if rate_limit is None:
         return uniform_schedule(duration, np.tile(best, (knots, 1)))
     first, last = (at.torque if at is not None and at.is_feasible else best for at in (begin, end))

@@ -30,8 +30,8 @@ class StrongHold(NamedTuple):
     is_strong: bool  # whether the object must stay
 
 
-def strong_hold(scene: Scene, phase: Phase, traced: TracedPhase, hand_over: HandOver | None) -> StrongHold | None:
-    """Return a torque that holds the object at a phase's start, by either contact of a hand-over; None: none does.
+def strong_hold(scene: Scene, phase: Phase, traced: TracedPhase, hand_over: HandOver | None) -> StrongHold:
+    """Return a torque that holds the object at a phase's start, by either contact of a hand-over.
 
     It is one under which the object must stay, or that with the largest margin if there is none.
     """
@@ -41,10 +41,8 @@ def strong_hold(scene: Scene, phase: Phase, traced: TracedPhase, hand_over: Hand
     else:
         balances = [(one.statics, one.accelerations) for one in hand_over]
         best = hand_over.best_hold()
-    if not best.margin > 0:
-        return None
-    if _must_stay(balances, best.torque[None]).all():
-        return StrongHold(best, is_strong=True)
+    if not best.margin > 0 or _must_stay(balances, best.torque[None]).all():
+        return StrongHold(best, is_strong=best.margin > 0)
     strong = _farthest_from_others(balances)
     return StrongHold(strong or best, is_strong=strong is not None)
 
