@@ -23,6 +23,7 @@ from wholearm_jax.phases import (
     Result,
     SimulatedPhase,
     certify_rest,
+    ends_at_contact,
     final_configuration,
     initial_carry,
     initial_loop_carry,
@@ -110,9 +111,8 @@ def check_on_paths(
         dynamics = tabulate_path_dynamics(mechanics, path)
         if isinstance(schedule, LawTables):
             actuation = phase_loop(schedule, tables, dynamics)
-            carry, simulated = loop_step(
-                schedule, fidelity.options, arrival, carry, (dynamics, actuation, tables, *inputs)
-            )
+            one = dynamics, actuation, tables, ends_at_contact(path), *inputs
+            carry, simulated = loop_step(schedule, fidelity.options, arrival, carry, one)
         else:
             actuation = schedule
             carry, simulated = scan_step(schedule, fidelity.options, arrival, carry, (dynamics, *inputs))

@@ -19,12 +19,13 @@ from wholearm_jax.feedback.reference_motion import (
     scheduled_motion,
     smooth_motions,
 )
-from wholearm_jax.feedback.stop_places import draw_shapes, has_paths, stop_places
+from wholearm_jax.feedback.stop_places import SHAPES_AT_STOPS, draw_shapes, has_paths, stop_places
 from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop, stays_at_stop
 from wholearm_jax.feedback.torque_choice import TorqueChoice, choose_torques
 from wholearm_jax.model import Arrival, Scene, TorqueSchedule
 from wholearm_jax.phases import (
     CLOSED_LOOP_TOLERANCE,
+    Result,
     TracedPhase,
     ends_at_stop,
     group_phases,
@@ -41,7 +42,7 @@ RESERVE = 0.9  # fraction of the torque limits that the reference's torques and 
 PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
 BEYOND = 0.06  # how far the reference goes on beyond the path's end, to meet the contact that ends it [rad]
 APPROACH = 0.15  # speed with which, at least [rad/s]
-SLOW_SHARE = 0.25  # of a phase's duration, at most, that the reference takes to cross where stops of other parts may be
+SLOW_SHARE = 0.4  # of a phase's duration, at most, that the reference takes to cross where stops of other parts may be
 FELT = (0.05, 0.03)  # speed [rad/s] below which an object stands, and for how long [s]
 LONGEST_DELAY = 1.0  # longest time beyond a phase's duration [s]
 ASIDE = 0.01  # how far an object may be from the reference's place on its path [rad]
@@ -93,8 +94,8 @@ def feedback(
         The controller.
 
     Raises:
-        ValueError: For numbers that are out of range, for a plan whose paths cannot be traced, and where both joints
-            stand still on a path.
+        ValueError: For numbers that are out of range, for a plan whose paths cannot be traced, where both joints stand
+            still on a path, and where a schedule fails whose motion is asked for.
     """
     require_positive(stiffness=stiffness, integral=integral, observer=observer)
     if not (0 <= friction < 1 and 0 <= mass < 1):
@@ -105,11 +106,13 @@ def feedback(
         if int(phase.traced.dynamics.status) != Status.OK:
             raise ValueError(phase.message)
     scenes = corner_scenes(scene, friction, mass)
+    _require_motions(result, own_motion)
     traces = [tuple(phase.traced for phase in result.phases), *(trace(other) for other in scenes[1:])]
     tables = [tabulate_path(path.dynamics) for path in traces[0]]
     shapes = draw_shapes(scenes, shape)
     drawn = [trace(other) for other in shapes]
-    approaches = _approaches(scene, traces[0], tables, drawn)
+    others = draw_shapes([scene], shape, seed=1, count=SHAPES_AT_STOPS - len(drawn))
+    approaches = _approaches(scene, traces[0], tables, [*drawn, *map(trace, others)])
     held = drawn if shape else []  # the others only say where stops may be
     terms = [
         _terms_of_set(table, [paths[k] for paths in traces], [paths[k] for paths in held if has_paths(paths[: k + 1])])
@@ -137,6 +140,16 @@ def feedback(
         torque_limit=np.asarray(scene.hand.torque_limit),
     )
     return _with_simulated_margins(controller, objects[: len(traces) + len(held)])
+
+
+def _require_motions(result: Result, own_motion: bool) -> None:
+    """Raise ValueError where a schedule fails whose motion is asked for, by itself or for the speeds to pass with."""
+    for group in group_phases(result.scene):
+        failed = next((result.phases[k].message for k in group if result.phases[k].status != Status.OK), None)
+        if failed and (own_motion or len(group) > 1):
+            name = result.phases[group[0]].name
+            why = "follow the schedule's motion" if own_motion else "follow one another without a stop"
+            raise ValueError(f"laws from {name} on {why}, which has to succeed (`optimise` finds one): {failed}")
 
 
 def _with_simulated_margins(controller: Controller, objects: list[tuple[Scene, tuple[TracedPhase, ...]]]) -> Controller:
@@ -208,13 +221,15 @@ def _motions(scene: Scene, group, tables, approaches, courses, own_motion: bool)
     if len(group) == 1:
         approach = approaches[group[0]] or Approach(0.0, 0.0, 0.0)
         return [[motion] for motion in smooth_motions(lengths[0], durations[0], approach.slow, approach.speed)]
+    stop = approaches[group[-1]] or Approach(0.0, 0.0, 0.0)
     speed = [np.hypot(*np.asarray(courses[k].z_dot)[[0, -1], 3:].T) for k in group]
     ratios = [after[0] / before[1] for before, after in itertools.pairwise(speed)]  # of the impacts
     options = []
     for share in PASSING:
         exits = [share * length / time for length, time in zip(lengths[:-1], durations, strict=False)]
         entries = [0.0, *(ratio * v for ratio, v in zip(ratios, exits, strict=True))]
-        options.append([passing_motion(*each) for each in zip(lengths, durations, entries, [*exits, 0.0], strict=True)])
+        *on_the_way, last = zip(lengths, durations, entries, [*exits, 0.0], strict=True)
+        options.append([*(passing_motion(*each) for each in on_the_way), passing_motion(*last, stop.slow, stop.speed)])
     return options
 
 

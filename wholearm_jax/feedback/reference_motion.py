@@ -46,14 +46,25 @@ def _profile_motion(p: int, q: int, length: float, duration: float, slow: float,
     return ReferenceMotion(time, place, speed(u) / fast, acceleration)
 
 
-def passing_motion(length: float, duration: float, entry: float, exit_: float) -> ReferenceMotion:
-    """Return the cubic motion over a path's `length` [rad] with given speeds [rad/s] at both ends."""
-    u = np.linspace(0.0, 1.0, TIMES)
-    entry, exit_ = (min(v * duration, 2.9 * length) for v in (entry, exit_))  # so that it never goes back
-    cubic = np.polynomial.Polynomial([0.0, entry, 3 * length - 2 * entry - exit_, entry + exit_ - 2 * length])
-    acceleration = cubic.deriv(2)(u) / duration**2
-    acceleration[-1] *= exit_ > 0
-    return ReferenceMotion(u * duration, cubic(u), cubic.deriv()(u) / duration, acceleration)
+def passing_motion(
+    length: float, duration: float, entry: float, exit_: float, slow: float = 0.0, approach: float = 0.0
+) -> ReferenceMotion:
+    """Return the motion over a path's `length` [rad] with given speeds [rad/s] at both ends.
+
+    Its place is cubic in time; for the last part `slow` [rad] of the path it goes on with the speed `approach` [rad/s].
+    """
+    time = np.linspace(0.0, duration, TIMES)
+    fast, far = (duration - slow / approach, length - slow) if slow > 0 else (duration, length)
+    u, last = np.minimum(time / fast, 1.0), approach if slow > 0 else exit_
+    entry, leaves = (min(v * fast, 2.9 * far) for v in (entry, last))  # so that it never goes back
+    cubic = np.polynomial.Polynomial([0.0, entry, 3 * far - 2 * entry - leaves, entry + leaves - 2 * far])
+    acceleration = cubic.deriv(2)(u) / fast**2
+    if last == 0:
+        acceleration[-1] = 0.0  # what stands is not braked any more
+    acceleration[time > fast] = 0.0
+    return ReferenceMotion(
+        time, cubic(u) + approach * np.maximum(time - fast, 0.0), cubic.deriv()(u) / fast, acceleration
+    )
 
 
 def scheduled_motion(table: PathTable, course: Trajectory) -> ReferenceMotion:

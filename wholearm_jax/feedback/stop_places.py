@@ -11,7 +11,8 @@ from wholearm_jax.feedback.path_table import PathTable
 from wholearm_jax.model import Scene, remains_simple, rigid_body
 from wholearm_jax.phases import TracedPhase
 
-SHAPES = 12  # parts that are drawn
+SHAPES = 12  # parts that are drawn to be held
+SHAPES_AT_STOPS = 64  # parts that are drawn to see where they stop
 RELATIVE_SHAPE = 0.01  # half width of a vertex's coordinates unless given [object radii]
 FARTHEST = 0.3  # distance from the nominal stop that is looked at, at most [path lengths]
 
@@ -23,8 +24,8 @@ class StopPlaces(NamedTuple):
     beyond: float
 
 
-def draw_shapes(scenes: list[Scene], shape: float | None, seed: int = 0) -> list[Scene]:
-    """Draw objects whose vertices are off by up to `shape` [m] in x and y, each else as one of `scenes`.
+def draw_shapes(scenes: list[Scene], shape: float | None, seed: int = 0, count: int = SHAPES) -> list[Scene]:
+    """Draw `count` objects whose vertices are off by up to `shape` [m] in x and y, each else as one of `scenes`.
 
     Raises:
         ValueError: Where edges of such an object could cross.
@@ -38,7 +39,7 @@ def draw_shapes(scenes: list[Scene], shape: float | None, seed: int = 0) -> list
     if not remains_simple(outline, np.full(len(outline), np.sqrt(2) * shape)):
         raise ValueError(f"shape {shape:.3g} m: too much, edges of the polygon could cross")
     random, drawn = np.random.default_rng(seed), []
-    for k in range(SHAPES):
+    for k in range(count):
         vertices = np.array(scene.object.vertices)
         vertices[: len(outline)] += random.uniform(-shape, shape, outline.shape)
         vertices[len(outline) :] = vertices[len(outline) - 1]

@@ -11,9 +11,9 @@ from wholearm_jax.margin import Statics, contact_statics
 from wholearm_jax.model import AWAY_NAMES, Phase, Scene
 from wholearm_jax.phases import TracedPhase, formation_at_end
 
-LARGEST, TRIED = 60.0, 13  # pushes that are tried [rad/s^2]
+LARGEST, TRIED = 60.0, 61  # pushes that are tried [rad/s^2]
 TURNS = np.linspace(-1.2, 1.2, 7)  # their directions against that which accelerates most [rad]
-DECISIVE = 10.0  # least acceleration of the object that is hardest to move, before it stops [rad/s^2]
+DECISIVE = 5.0  # least acceleration of the object that is hardest to move, before it stops [rad/s^2]
 
 
 class StopStatics(NamedTuple):

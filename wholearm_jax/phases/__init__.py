@@ -6,6 +6,7 @@ from wholearm_jax.phases.closed_loop import (
     CLOSED_LOOP_TOLERANCE,
     closed_loop_margin,
     closed_loop_options,
+    ends_at_contact,
     initial_loop_carry,
     loop_step,
     require_phases,

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from wholearm_jax.core import CachedJit, as_strong_array, is_traced, unstack_trees
+from wholearm_jax.core import CachedJit, Status, as_strong_array, is_traced, unstack_trees
 from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.model import LawTables, PhaseTables, Scene
 from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR
@@ -31,7 +31,7 @@ from wholearm_jax.simulation import (
     place_on_path,
     tolerance_as_data,
 )
-from wholearm_jax.tracing import Resolution
+from wholearm_jax.tracing import ContactPath, PathEnd, Resolution
 
 CLOSED_LOOP_ARRIVAL = 0.01  # distance from the path's end within which a phase must end, in path lengths
 LANDING = 2.0  # speed at which an object may meet the stop that ends a phase, over that of the approach
@@ -64,16 +64,18 @@ def initial_loop_carry(law: LawTables) -> LoopCarry:
 def loop_step(law: LawTables, options: IntegratorOptions, arrival, carry: LoopCarry, phase):
     """Simulate the next phase of a plan under its law: one step of a scan.
 
-    `phase` is (dynamics, its `phase_loop`, its tables, *phase_inputs(phase)).
+    `phase` is (dynamics, its `phase_loop`, its tables, whether a new contact ends its path, *phase_inputs(phase)).
     """
-    dynamics, loop, tables, _, goal, is_left_moving = phase
+    dynamics, loop, tables, ends_at_contact, _, goal, is_left_moving = phase
     begin = place_on_path(loop, dynamics, jnp.zeros((), int), dynamics.breakpoints[0])
     duration = loop_duration(law, tables)
     speed = carry.speed * (carry.tangent @ tables.tangent[0])
     memory = jnp.stack([begin, speed, jnp.zeros_like(begin)])
 
     def is_slow(motion: Motion):
-        return _ends_slowly(law, tables, loop, dynamics, motion, arrival)
+        slow = _ends_slowly(law, tables, loop, dynamics, motion, arrival)
+        presses_on = (tables.reach > 0) & ~ends_at_contact & (motion.status == int(Status.LEFT_FORMATION))
+        return slow & ~presses_on  # beyond the end of a feature, with nothing in the way
 
     arrival = as_strong_array(arrival, begin.dtype)
     common = dynamics, loop, carry.start, duration, carry.velocity, options, goal, arrival
@@ -118,8 +120,9 @@ def simulate_closed_loop(
     options = tolerance_as_data(closed_loop_options(options), law.stiffness.dtype)
     laws = unstack_trees(law.phases, law.count)
     for path, tables, phase in zip(traced, laws, scene.phases, strict=True):
-        carry, one = _simulate_phase(law, options, arrival, carry, (path.dynamics, tables, *phase_inputs(phase)))
-        found.append(one)
+        one = path.dynamics, tables, ends_at_contact(path.path), *phase_inputs(phase)
+        carry, simulated = _simulate_phase(law, options, arrival, carry, one)
+        found.append(simulated)
     return tuple(found)
 
 
@@ -128,6 +131,11 @@ def _simulate_phase(law: LawTables, options: IntegratorOptions, arrival, carry: 
     """Prepare the law of a phase, and simulate it."""
     dynamics, tables, *inputs = phase
     return loop_step(law, options, arrival, carry, (dynamics, phase_loop(law, tables, dynamics), tables, *inputs))
+
+
+def ends_at_contact(path: ContactPath) -> Bool[Array, "*lanes"]:
+    """Return whether a new contact ends a path."""
+    return path.end_reason == int(PathEnd.CONTACT_MADE)
 
 
 def require_phases(scene: Scene, law: LawTables) -> None:
