@@ -5,7 +5,7 @@ import pytest
 
 import wholearm_jax as wa
 from wholearm_jax.execution import Amounts, run_trials
-from wholearm_jax.feedback import feedback
+from wholearm_jax.feedback import feedback, stop_torque
 from wholearm_jax.feedback.design import corner_scenes
 from wholearm_jax.feedback.path_table import tabulate_path
 from wholearm_jax.feedback.reference_motion import passing_motion, smooth_motions
@@ -87,6 +87,18 @@ def test_the_push_at_a_stop_has_the_largest_margin_of_all_that_move_every_object
                 tried += 1
                 assert margin(under) <= found + 1e-9
     assert tried > 10
+
+
+def test_a_push_that_tips_objects_over_their_stop_makes_the_margin_negative(heptagon, monkeypatch):
+    """Where every object is to be moved by no less than 16 rad/s^2, one of the set does not stay at its stop."""
+    scene, torque = heptagon.scene, heptagon.torque
+    assert feedback(scene, torque, friction=0.2).margin > 0
+    monkeypatch.setattr(stop_torque, "DECISIVE", 16.0)
+    law = feedback(scene, torque, friction=0.2).phases[1]
+    under = law.torque[-1] + law.press * law.gain[-1]
+    stops = [object_at_stop(one, scene.phases[1], wa.trace(one)[1]) for one in corner_scenes(scene, 0.2, 0.0)]
+    assert law.margin == pytest.approx(min(stop.statics.margin_under(under).margin for stop in stops), abs=1e-9)
+    assert law.margin < 0
 
 
 def test_without_a_shape_the_reference_stops_at_the_end(heptagon):

@@ -49,6 +49,14 @@ ASIDE = 0.01  # how far an object may be from the reference's place on its path 
 UNSURE = 0.005  # distance from a corner within which angles do not tell its sides: 3 counts of 4096 a turn [rad]
 
 
+class Part(NamedTuple):
+    """An object that a law is designed with, and its paths; one that need not be held only says where it stops."""
+
+    scene: Scene
+    paths: tuple[TracedPhase, ...]
+    is_held: bool
+
+
 class Approach(NamedTuple):
     """How a phase comes to its end: the last part of the path is slow before a stop, and the reference reaches on."""
 
@@ -120,14 +128,15 @@ def feedback(
     ]
     either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
     limit = RESERVE * np.asarray(scene.hand.torque_limit)
-    objects = [*zip(scenes, traces, strict=True), *zip(shapes, drawn, strict=True)]
+    parts = [Part(*each, is_held=True) for each in zip(scenes, traces, strict=True)]
+    parts += [Part(*each, is_held=bool(shape)) for each in zip(shapes, drawn, strict=True)]
     laws = []
     for group in group_phases(scene):
         options = _motions(scene, group, tables, approaches, trajectory(result), own_motion)
         choices = [[_choose(either[k], tables[k], limit, m) for k, m in zip(group, o, strict=True)] for o in options]
         best = int(np.argmax([min(float(c.margin.min()) for c in row) for row in choices]))
         for k, motion, choice in zip(group, options[best], choices[best], strict=True):
-            laws.append(_phase_law(scene, k, tables[k], terms[k][0], motion, choice, approaches[k], objects))
+            laws.append(_phase_law(scene, k, tables[k], terms[k][0], motion, choice, approaches[k], parts))
     controller = Controller(
         title=scene.title,
         phases=tuple(laws),
@@ -139,7 +148,7 @@ def feedback(
         patience=LONGEST_DELAY,
         torque_limit=np.asarray(scene.hand.torque_limit),
     )
-    return _with_simulated_margins(controller, objects[: len(traces) + len(held)])
+    return _with_simulated_margins(controller, parts)
 
 
 def _require_motions(result: Result, own_motion: bool) -> None:
@@ -152,14 +161,15 @@ def _require_motions(result: Result, own_motion: bool) -> None:
             raise ValueError(f"laws from {name} on {why}, which has to succeed (`optimise` finds one): {failed}")
 
 
-def _with_simulated_margins(controller: Controller, objects: list[tuple[Scene, tuple[TracedPhase, ...]]]) -> Controller:
-    """Lower the margins of a controller to those of objects that are simulated under it.
+def _with_simulated_margins(controller: Controller, parts: list[Part]) -> Controller:
+    """Lower the margins of a controller to those of the parts to be held, simulated under it.
 
     The choice of torques lets every object move as the reference does; in closed loop one of other friction is late,
     or early, until the loop has made up for it.
     """
     tables, options = law_tables(controller), IntegratorOptions(tolerance=CLOSED_LOOP_TOLERANCE)
-    runs = [simulate_closed_loop(scene, tables, paths, options) for scene, paths in objects if has_paths(paths)]
+    held = [part for part in parts if part.is_held and has_paths(part.paths)]
+    runs = [simulate_closed_loop(part.scene, tables, part.paths, options) for part in held]
     margins = np.array([[float(phase.margin_result.margin) for phase in run] for run in runs])
     least = np.where(np.isnan(margins).any(0), -np.inf, margins.min(0)).tolist()
     phases = zip(controller.phases, least, strict=True)
@@ -302,18 +312,21 @@ def _phase_law(
     motion: ReferenceMotion,
     choice: TorqueChoice,
     approach: Approach | None,
-    objects: list[tuple[Scene, tuple[TracedPhase, ...]]],
+    parts: list[Part],
 ) -> PhaseLaw:
-    """Put the law of phase `k` together, for the nominal object's `terms` and the stops of all objects with paths."""
+    """Put the law of phase `k` together, for the nominal object's `terms` and the stops of all parts with paths."""
     phase = scene.phases[k]
     gain = np.stack([np.interp(table.s, motion.s, choice.gain[:, j]) for j in range(2)], axis=1)
-    flows, press, speed = phase.arrive is Arrival.MOVING, 0.0, APPROACH
+    flows, press, speed, margin = phase.arrive is Arrival.MOVING, 0.0, APPROACH, float(choice.margin.min())
     reach = approach.reach if approach is not None else 0.0
     if approach is not None and not flows:
-        stops = [object_at_stop(one, phase, paths[k]) for one, paths in objects if has_paths(paths[: k + 1])]
+        stopped = [part for part in parts if has_paths(part.paths[: k + 1])]
+        stops = [object_at_stop(part.scene, phase, part.paths[k]) for part in stopped]
         limit, either = np.asarray(scene.hand.torque_limit), not phase.has_free_finger
         press, gain_at_stop = choose_push(stops, choice.torque[-1], limit, either_finger=either)
         gain[table.s > table.s[-1] - reach] = gain_at_stop
+        held = [stop for stop, part in zip(stops, stopped, strict=True) if part.is_held]
+        margin = min(margin, *(stop.pressed_over(choice.torque[-1] + press * gain_at_stop) for stop in held))
         speed = approach.speed
     gain /= (gain * terms.acceleration[:, 3:]).sum(1, keepdims=True)
     if approach is not None and flows:  # it goes on as it comes, and nothing bounds the feedback more than on the way
@@ -333,5 +346,5 @@ def _phase_law(
         reach=reach,
         approach=speed,
         press=press,
-        margin=float(choice.margin.min()),
+        margin=margin,
     )

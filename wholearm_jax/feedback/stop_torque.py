@@ -22,6 +22,11 @@ class StopStatics(NamedTuple):
     statics: Statics
     acceleration: Float[np.ndarray, "5"]  # of `PathTerms`, at the path's end
 
+    def pressed_over(self, torque: Float[np.ndarray, "2"]) -> float:
+        """Return the margin [N] at rest under a torque where that is negative, as it tips the object; else infinity."""
+        margin = self.statics.margin_under(torque).margin
+        return margin if margin < 0 else np.inf
+
 
 def object_at_stop(scene: Scene, phase: Phase, path: TracedPhase) -> StopStatics:
     """Return an object at the end of its path of a phase. A finger that is away has no torque, whatever touches it."""
