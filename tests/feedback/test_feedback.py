@@ -171,6 +171,7 @@ def test_a_law_is_written_only_where_it_holds_the_whole_set(least, code, wholear
     assert (smaller in err) == (code == 1)
     pulls = "'flip right': for some objects of the set the impulse at its beginning pulls at palm:v4, 2.1 % of the"
     assert (pulls in err) == (code == 0)
+    assert "SCENE --feedback" not in err, "that is what was just asked for"
 
 
 @pytest.mark.slow

@@ -87,7 +87,7 @@ def optimise(
         _print_optimised(optimum)
     values = tuple(float(b.value) for b in optimum.bounds)
     controller = _design(optimum, uncertain, as_json) if feedback and optimum.result.status is Status.OK else None
-    more |= {"controller": controller, "bounds": values}
+    more |= {"controller": controller, "law_is_asked_for": feedback, "bounds": values}
     if feedback and controller is None and optimum.result.status is Status.OK:
         write_result(optimum.result, folder, samples or 201, as_json, report=report, **more)
         sys.exit(1)

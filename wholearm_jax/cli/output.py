@@ -23,11 +23,19 @@ def write_and_exit(result, folder: Path | None, samples: int, as_json: bool, rep
 
 
 def write_result(
-    result, folder: Path | None, samples: int, as_json: bool, report: bool = False, controller=None, **more
+    result,
+    folder: Path | None,
+    samples: int,
+    as_json: bool,
+    report: bool = False,
+    controller=None,
+    law_is_asked_for: bool = False,
+    **more,
 ) -> None:
     """Write the files in place of those of an earlier result, and print the result's message or the summary.
 
-    A result without torques is not written, and one that is not `ok` not over one that is: notes say so.
+    A result without torques is not written, and one that is not `ok` not over one that is: notes say so. Another says
+    what torques must be like open loop, unless a law is asked for (`controller`, None where there is none).
     """
     import numpy as np
 
@@ -46,7 +54,7 @@ def write_result(
         print_json(content)
     else:
         print(result.message if not folder else f"{result.message} -> {folder}")
-        if controller is None:
+        if not law_is_asked_for:
             _note_accuracy(content)
 
 
