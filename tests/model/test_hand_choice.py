@@ -12,6 +12,7 @@ PARTS = {
     "bracket": [(0, 0), (60, 0), (60, 20), (20, 20), (20, 50), (0, 50)],
     "triangle": [(0, 0), (40, 0), (20, 50)],
     "tall": [(0, 0), (0, -50), (30, -50), (30, 0)],
+    "trapezoid": [(0, 0), (56, 0), (42, 21), (14, 21)],
     "disc": [(30 * np.cos(a), 30 * np.sin(a)) for a in np.linspace(0, 2 * np.pi, 40, endpoint=False)],
 }
 
@@ -43,6 +44,23 @@ def test_the_fingers_close_on_the_part_without_meeting(name, scale):
     assert (choice.width, choice.height) == pytest.approx((high - low, top))
     assert low > float(choice.hand.joint[1, 0])
     assert high < float(choice.hand.joint[0, 0])
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_fingertips_are_away_from_the_corners_that_they_touch(name):
+    """At a corner a first slide would end at once: the trapezoid's was 0.1 mm long."""
+    vertices = 1e-3 * np.array(PARTS[name], float)
+    shape = polygon(vertices, 0.1, 0.1)
+    choice = choose_hand(shape)
+    z = resting_configuration(shape, choice.hand, choice.edge, choice.x)
+    centre = shapely.Polygon(vertices).centroid.coords[0]
+    placed = affinity.translate(
+        affinity.rotate(shapely.MultiPoint(vertices), z[2], centre, use_radians=True), *(z[:2] - centre)
+    )
+    for finger in segments(choice.hand, z[3:]):
+        tip = shapely.Point(finger.coords[1])
+        corners = [corner for corner in placed.geoms if finger.distance(corner) < 1e-8] or placed.geoms
+        assert min(tip.distance(corner) for corner in corners) > 0.05 * (choice.width + choice.height)
 
 
 def test_a_part_rests_where_it_tips_last():

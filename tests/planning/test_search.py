@@ -53,6 +53,14 @@ def test_plans_arrive_when_traced_anew(part, turned):
         assert one.bound > 0
 
 
+def test_a_trapezoid_slides_in_the_hand_that_is_chosen_for_it(tmp_path):
+    """What `wholearm scene` says to go on with: fingers that end at its corners could not slide it."""
+    (tmp_path / "part.csv").write_text("x [mm],y [mm]\n0,0\n56,0\n42,21\n14,21\n")
+    scene = wa.scene_from_outline(wa.read_outline(tmp_path / "part.csv"))
+    found = wa.plan(scene, by={"x": -0.006}, count=1, max_nodes=20)
+    assert found.found, found.reason
+
+
 @pytest.mark.slow
 def test_the_best_plan_can_be_optimised_as_it_is(turned):
     optimum = wa.optimise(turned.plans[0].scene, knots=21)

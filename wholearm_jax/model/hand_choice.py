@@ -15,12 +15,14 @@ from jaxtyping import Float
 from wholearm_jax.core import as_device_array
 from wholearm_jax.model.hand_collisions import link_overlaps
 from wholearm_jax.model.resting import hull_edges, lying_angle, resting_angle, resting_configuration
-from wholearm_jax.model.scene import Hand, Polygon, rigid_body
+from wholearm_jax.model.scene import Hand, Polygon, RigidBody, rigid_body
 
 GRAVITY = 9.81  # [m/s^2], of the loads that the joints are made for
 SPAN = (1.3, 1.15, 1.45, 1.6)  # distance of the joints over the object's width at rest, in the order of preference
 REACH = (1.1, 0.85, 0.7, 0.55, 0.4)  # length of the fingers over the sum of the object's width and height at rest
 CLEARANCE = (0.15, 0.02)  # least distance between the fingers at the start, over that sum: wanted, and accepted
+ROOM = (0.05, 0.0)  # least distance of a fingertip from a vertex that its finger touches, over that sum: likewise
+TOUCHING = 1e-6  # distance from a finger at which a vertex touches it, over its length
 # The design, made dimensionless by the object's mass m, gravity g and the fingers' length L.
 JOINT_INERTIA = 0.6  # m L^2
 JOINT_VISCOSITY = 0.7  # m g L sqrt(L / g)
@@ -60,9 +62,10 @@ def choose_hand(shape: Polygon, edge: int | None = None) -> HandChoice:
         at = _rotated(corners, resting_angle(corners, on))
         width, height = np.ptp(at, axis=0).tolist()
         x = round(-(at[:, 0].min() + at[:, 0].max()) / 2, _DIGITS) + 0.0
-        for span, reach in itertools.product(SPAN, REACH):
-            hand = scaled_hand(span * width, reach * (width + height), float(body.mass))
-            if _fits(shape, hand, on, x, clearance * (width + height)):
+        size = width + height
+        for room, span, reach in itertools.product(ROOM, SPAN, REACH):
+            hand = scaled_hand(span * width, reach * size, float(body.mass))
+            if _fits(shape, hand, on, x, clearance * size, room * size):
                 return HandChoice(hand, on, x, tipping_angle, width, height)
     where = "any edge on which it can lie" if edge is None else f"e{edge}"
     raise ValueError(f"no hand closes on the object on {where}")
@@ -122,10 +125,26 @@ def _rotated(corners: np.ndarray, phi: float) -> np.ndarray:
     return corners @ turn.T
 
 
-def _fits(shape: Polygon, hand: Hand, edge: int, x: float, clearance: float) -> bool:
-    """Say whether both fingers close on the object on an edge, apart from one another."""
+def _fits(shape: Polygon, hand: Hand, edge: int, x: float, clearance: float, room: float) -> bool:
+    """Say whether both fingers close on the object on an edge, apart from one another, their tips from what they touch.
+
+    Where a fingertip is at a vertex that it touches, or touches an edge at its end, a first slide would end at once.
+    """
     try:
         z = resting_configuration(shape, hand, edge, x)
     except ValueError:
         return False
-    return float(link_overlaps(hand, as_device_array(z[3:]))[0]) < -clearance
+    apart = float(link_overlaps(hand, as_device_array(z[3:]))[0]) < -clearance
+    return apart and _room_at_tips(rigid_body(shape), hand, np.asarray(z)) >= room
+
+
+def _room_at_tips(body: RigidBody, hand: Hand, z: Float[np.ndarray, "5"]) -> float:
+    """Return the least distance of a fingertip from a vertex [m]: of those that its finger touches, or else of any."""
+    corners = _rotated(np.asarray(body.vertices)[: int(body.count)], z[2]) + z[:2]
+    found = []
+    for joint, length, theta in zip(np.asarray(hand.joint), np.asarray(hand.length), z[3:], strict=True):
+        along, aside = _rotated(corners - joint, -theta).T
+        touching = (np.abs(aside) < TOUCHING * length) & (along > 0) & (along <= length * (1 + TOUCHING))
+        near = touching if touching.any() else np.full(len(along), True)
+        found.append(np.hypot(along - length, aside)[near].min())
+    return float(min(found))
