@@ -21,7 +21,10 @@ GRAVITY = 9.81  # [m/s^2], of the loads that the joints are made for
 SPAN = (1.3, 1.15, 1.45, 1.6)  # distance of the joints over the object's width at rest, in the order of preference
 REACH = (1.1, 0.85, 0.7, 0.55, 0.4)  # length of the fingers over the sum of the object's width and height at rest
 CLEARANCE = (0.15, 0.02)  # least distance between the fingers at the start, over that sum: wanted, and accepted
-ROOM = (0.05, 0.0)  # least distance of a fingertip from a vertex that its finger touches, over that sum: likewise
+TIP_DISTANCE = (0.05, 0.0)  # least distance of a fingertip from a vertex that its finger touches, over it: likewise
+    0.05,
+    0.0,
+)  # least distance of a fingertip from a vertex that its finger touches, over that sum: likewise
 TOUCHING = 1e-6  # distance from a finger at which a vertex touches it, over its length
 # The design, made dimensionless by the object's mass m, gravity g and the fingers' length L.
 JOINT_INERTIA = 0.6  # m L^2
@@ -63,9 +66,9 @@ def choose_hand(shape: Polygon, edge: int | None = None) -> HandChoice:
         width, height = np.ptp(at, axis=0).tolist()
         x = round(-(at[:, 0].min() + at[:, 0].max()) / 2, _DIGITS) + 0.0
         size = width + height
-        for room, span, reach in itertools.product(ROOM, SPAN, REACH):
+        for apart, span, reach in itertools.product(TIP_DISTANCE, SPAN, REACH):
             hand = scaled_hand(span * width, reach * size, float(body.mass))
-            if _fits(shape, hand, on, x, clearance * size, room * size):
+            if _fits(shape, hand, on, x, clearance * size, apart * size):
                 return HandChoice(hand, on, x, tipping_angle, width, height)
     where = "any edge on which it can lie" if edge is None else f"e{edge}"
     raise ValueError(f"no hand closes on the object on {where}")
@@ -125,7 +128,7 @@ def _rotated(corners: np.ndarray, phi: float) -> np.ndarray:
     return corners @ turn.T
 
 
-def _fits(shape: Polygon, hand: Hand, edge: int, x: float, clearance: float, room: float) -> bool:
+def _fits(shape: Polygon, hand: Hand, edge: int, x: float, clearance: float, tip_distance: float) -> bool:
     """Say whether both fingers close on the object on an edge, apart from one another, their tips from what they touch.
 
     Where a fingertip is at a vertex that it touches, or touches an edge at its end, a first slide would end at once.
@@ -135,10 +138,10 @@ def _fits(shape: Polygon, hand: Hand, edge: int, x: float, clearance: float, roo
     except ValueError:
         return False
     apart = float(link_overlaps(hand, as_device_array(z[3:]))[0]) < -clearance
-    return apart and _room_at_tips(rigid_body(shape), hand, np.asarray(z)) >= room
+    return apart and _distance_of_tips(rigid_body(shape), hand, np.asarray(z)) >= tip_distance
 
 
-def _room_at_tips(body: RigidBody, hand: Hand, z: Float[np.ndarray, "5"]) -> float:
+def _distance_of_tips(body: RigidBody, hand: Hand, z: Float[np.ndarray, "5"]) -> float:
     """Return the least distance of a fingertip from a vertex [m]: of those that its finger touches, or else of any."""
     corners = _rotated(np.asarray(body.vertices)[: int(body.count)], z[2]) + z[:2]
     found = []
