@@ -21,7 +21,7 @@ GRAVITY = 9.81  # [m/s^2], of the loads that the joints are made for
 SPAN = (1.3, 1.15, 1.45, 1.6)  # distance of the joints over the object's width at rest, in the order of preference
 REACH = (1.1, 0.85, 0.7, 0.55, 0.4)  # length of the fingers over the sum of the object's width and height at rest
 CLEARANCE = (0.15, 0.02)  # least distance between the fingers at the start, over that sum: wanted, and accepted
-TIP_DISTANCE = (0.05, 0.0)  # least distance of a fingertip from a vertex that its finger touches, over it: likewise
+TIP_DISTANCE = (0.05, 0.0)  # least of a fingertip from a vertex that its finger touches, over that sum: likewise
 TOUCHING = 1e-6  # distance from a finger at which a vertex touches it, over its length
 # The design, made dimensionless by the object's mass m, gravity g and the fingers' length L.
 JOINT_INERTIA = 0.6  # m L^2
