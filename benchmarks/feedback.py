@@ -5,9 +5,8 @@
 Two sets: friction of each link within 20 %, and that together with mass within 10 %, vertices within 0.5 mm and the
 start within 1 mm; for each a law is designed. Both loops see the same objects, the open one fewer of them if wanted;
 success is within 0.5 mm and 0.01 rad of each object's own path end, the last contacts closed. The closed loop samples
-at 1 kHz, 1 ms late, with encoders of 4096 counts and 1 % of torque noise.
-The hexagon's flip begins at a limit of its motors, with which no law holds either set
-(it is executed all the same), so that it is here with stronger ones, too.
+at 1 kHz, 1 ms late, with encoders of 4096 counts and 1 % of torque noise. The hexagon's flip begins at a limit of its
+motors, with which no law holds either set (it is executed all the same), so that it is here with stronger ones, too.
 
 Beside each execution stands what `check` predicts of that object: whether it arrives with every contact kept, and the
 least force. Each law's certificate, the margin that it is designed with, stands beside the least margin of objects that

@@ -113,8 +113,8 @@ def feedback(
     for phase in result.phases:
         if int(phase.traced.dynamics.status) != Status.OK:
             raise ValueError(phase.message)
-    scenes = corner_scenes(scene, friction, mass)
     _require_motions(result, own_motion)
+    scenes = corner_scenes(scene, friction, mass)
     traces = [tuple(phase.traced for phase in result.phases), *(trace(other) for other in scenes[1:])]
     tables = [tabulate_path(path.dynamics) for path in traces[0]]
     shapes = draw_shapes(scenes, shape)
@@ -129,7 +129,7 @@ def feedback(
     either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
     limit = RESERVE * np.asarray(scene.hand.torque_limit)
     parts = [Part(*each, is_held=True) for each in zip(scenes, traces, strict=True)]
-    parts += [Part(*each, is_held=bool(shape)) for each in zip(shapes, drawn, strict=True)]
+    parts += [Part(*each, is_held=bool(held)) for each in zip(shapes, drawn, strict=True)]
     laws = []
     for group in group_phases(scene):
         options = _motions(scene, group, tables, approaches, trajectory(result), own_motion)

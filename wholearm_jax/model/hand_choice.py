@@ -63,9 +63,9 @@ def choose_hand(shape: Polygon, edge: int | None = None) -> HandChoice:
         width, height = np.ptp(at, axis=0).tolist()
         x = round(-(at[:, 0].min() + at[:, 0].max()) / 2, _DIGITS) + 0.0
         size = width + height
-        for apart, span, reach in itertools.product(TIP_DISTANCE, SPAN, REACH):
+        for tip_distance, span, reach in itertools.product(TIP_DISTANCE, SPAN, REACH):
             hand = scaled_hand(span * width, reach * size, float(body.mass))
-            if _fits(shape, hand, on, x, clearance * size, apart * size):
+            if _fits(shape, hand, on, x, clearance * size, tip_distance * size):
                 return HandChoice(hand, on, x, tipping_angle, width, height)
     where = "any edge on which it can lie" if edge is None else f"e{edge}"
     raise ValueError(f"no hand closes on the object on {where}")
