@@ -45,7 +45,7 @@ APPROACH = 0.15  # speed with which, at least [rad/s]
 SLOW_SHARE = 0.4  # of a phase's duration, at most, that the reference takes to cross where stops of other parts may be
 FELT = (0.05, 0.03)  # speed [rad/s] below which an object stands, and for how long [s]
 LONGEST_DELAY = 1.0  # longest time beyond a phase's duration [s]
-ASIDE = 0.01  # how far an object may be from the reference's place on its path [rad]
+ASIDE = 0.02  # how far an object may be from the reference's place on its path: 0.5 mm of a radius of 25 mm [rad]
 UNSURE = 0.005  # distance from a corner within which angles do not tell its sides: 3 counts of 4096 a turn [rad]
 
 
