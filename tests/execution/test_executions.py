@@ -571,6 +571,7 @@ def test_who_goes_astray_open_loop_is_told_what_helps(wholearm, tmp_path):
     assert code == 1
     assert "executed: astray" in out
     assert "open loop nothing corrects the object" in err
+    assert "--timestep 0.0002" in err
     assert "wholearm optimise SCENE --feedback" in err
 
 

@@ -106,7 +106,7 @@ def execute(
         print_json(content)
     else:
         _print_execution(execution, trials, folder)
-    _note_astray(prediction, law, execution.ending.value)
+    _note_astray(prediction, law, execution)
     sys.exit(0 if ok else 1)
 
 
@@ -167,17 +167,18 @@ def _print_execution(execution, trials, folder: Path | None) -> None:
     print(f"executed: {execution.message}" + (f" -> {folder}" if folder else ""))
 
 
-def _note_astray(prediction, law, ending: str) -> None:
+def _note_astray(prediction, law, execution) -> None:
     """Where the object goes astray without a law, say how exact torques must be, and what helps."""
     from wholearm_jax.phases import torque_accuracy
 
-    if law is not None or ending != "astray":
+    if law is not None or execution.ending.value != "astray":
         return
     accuracy = min((one for one in torque_accuracy(prediction) if one > 0), default=float("inf"))  # NaN left out
     must = f", and torques would have to be right to {100 * accuracy:.2g} %" if accuracy < 1 else ""
     note(
         f"open loop nothing corrects the object{must}; a law does: wholearm optimise SCENE --feedback --out DIR,"
-        " then execute it with --controller DIR/controller.json"
+        " then execute it with --controller DIR/controller.json; --timestep"
+        f" {execution.timestep / 4:g} says whether only this simulation's steps are too long"
     )
 
 

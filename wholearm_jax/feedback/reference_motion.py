@@ -33,17 +33,11 @@ def smooth_motions(length: float, duration: float, slow: float = 0.0, approach: 
 
 def _profile_motion(p: int, q: int, length: float, duration: float, slow: float, approach: float) -> ReferenceMotion:
     # Up to the slow part, at `fast` [s], the speed is a polynomial in u, with a part that rises to the approach's.
-    time = np.linspace(0.0, duration, TIMES)
     fast = duration - slow / approach if slow > 0 else duration
     rise = np.polynomial.Polynomial([0.0, 0.0, 3.0, -2.0]) * (approach * fast if slow > 0 else 0.0)
     bump = np.polynomial.Polynomial([0.0] * p + [1.0]) * np.polynomial.Polynomial([1.0, -1.0]) ** q
     unit = (length - slow - rise.integ()(1.0)) / bump.integ()(1.0)
-    speed = unit * bump + rise
-    u = np.minimum(time / fast, 1.0)
-    acceleration = speed.deriv()(u) / fast**2
-    acceleration[time >= fast] = 0.0  # what stands is not braked any more
-    place = speed.integ()(u) + approach * np.maximum(time - fast, 0.0)
-    return ReferenceMotion(time, place, speed(u) / fast, acceleration)
+    return _then_slowly((unit * bump + rise).integ(), fast, duration, approach if slow > 0 else 0.0)
 
 
 def passing_motion(
@@ -53,18 +47,27 @@ def passing_motion(
 
     Its place is cubic in time; for the last part `slow` [rad] of the path it goes on with the speed `approach` [rad/s].
     """
-    time = np.linspace(0.0, duration, TIMES)
     fast, far = (duration - slow / approach, length - slow) if slow > 0 else (duration, length)
-    u, last = np.minimum(time / fast, 1.0), approach if slow > 0 else exit_
+    last = approach if slow > 0 else exit_
     entry, leaves = (min(v * fast, 2.9 * far) for v in (entry, last))  # so that it never goes back
     cubic = np.polynomial.Polynomial([0.0, entry, 3 * far - 2 * entry - leaves, entry + leaves - 2 * far])
-    acceleration = cubic.deriv(2)(u) / fast**2
-    if last == 0:
-        acceleration[-1] = 0.0  # what stands is not braked any more
-    acceleration[time > fast] = 0.0
-    return ReferenceMotion(
-        time, cubic(u) + approach * np.maximum(time - fast, 0.0), cubic.deriv()(u) / fast, acceleration
-    )
+    return _then_slowly(cubic, fast, duration, last, is_steady=slow > 0 or exit_ == 0)
+
+
+def _then_slowly(
+    place: np.polynomial.Polynomial, fast: float, duration: float, approach: float, is_steady: bool = True
+) -> ReferenceMotion:
+    """Return a motion whose place is a polynomial in the share of `fast` [s], and then goes on with one speed.
+
+    Where it `is_steady` at the end, what stands, or goes on, is not braked any more.
+    """
+    time = np.linspace(0.0, duration, TIMES)
+    u, beyond = np.minimum(time / fast, 1.0), np.maximum(time - fast, 0.0)
+    speed, acceleration = place.deriv()(u) / fast, place.deriv(2)(u) / fast**2
+    steady = time > fast
+    steady[-1] = is_steady
+    speed[steady], acceleration[steady] = approach, 0.0
+    return ReferenceMotion(time, place(u) + approach * beyond, speed, acceleration)
 
 
 def scheduled_motion(table: PathTable, course: Trajectory) -> ReferenceMotion:
