@@ -84,6 +84,7 @@ def summary(trials: TrialsResult, model) -> dict:
     return {
         "executions": count,
         "successes": trials.own_successes,
+        "without_own_end": sum(run.own_target is None for run in runs),
         "nominal_successes": trials.successes,
         "interval_95": list(wilson_interval(trials.own_successes, count)),
         "median_position_error": float(np.nanmedian([run.own_position_error for run in runs])),

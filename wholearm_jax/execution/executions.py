@@ -44,7 +44,7 @@ from wholearm_jax.model import (
     Scene,
     TorqueSchedule,
     feature_pair,
-    rigid_body,
+    object_radius,
 )
 from wholearm_jax.phases import END_ANGLE, END_POSITION, Result, target_configuration, trajectory
 
@@ -214,7 +214,7 @@ def motor_torques(
 def start_of(prediction: Result) -> Float[np.ndarray, "5"]:
     """The projected start of the plan's first path."""
     traced = prediction.phases[0].traced
-    radius = np.hypot(*np.asarray(rigid_body(prediction.scene.object).vertices).T).max()
+    radius = object_radius(prediction.scene.object)
     return np.asarray(traced.path.start) * np.array([radius, radius, 1.0, 1.0, 1.0])
 
 

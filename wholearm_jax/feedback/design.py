@@ -20,7 +20,7 @@ from wholearm_jax.feedback.reference_motion import (
     smooth_motions,
 )
 from wholearm_jax.feedback.stop_places import SHAPES_AT_STOPS, draw_shapes, has_paths, stop_places
-from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop, stays_at_stop
+from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop, slowness, stays_at_stop
 from wholearm_jax.feedback.torque_choice import TorqueChoice, choose_torques
 from wholearm_jax.model import Arrival, Scene, TorqueSchedule
 from wholearm_jax.phases import (
@@ -41,10 +41,10 @@ from wholearm_jax.simulation import IntegratorOptions
 RESERVE = 0.9  # fraction of the torque limits that the reference's torques and their corrections stay within
 PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
 BEYOND = 0.06  # how far the reference goes on beyond the path's end, to meet the contact that ends it [rad]
-APPROACH = 0.15  # speed with which, at least [rad/s]
+APPROACH = 0.15  # speed with which, at least, of an object that is not large (`slowness`) [rad/s]
 SLOW_SHARE = 0.4  # of a phase's duration, at most, that the reference takes to cross where stops of other parts may be
-FELT = (0.05, 0.03)  # speed [rad/s] below which an object stands, and for how long [s]
-LONGEST_DELAY = 1.0  # longest time beyond a phase's duration [s]
+FELT = (0.05, 0.03)  # speed [rad/s] below which such an object stands, and for how long [s]
+LONGEST_DELAY = 1.0  # longest time beyond a phase's duration, for such an object [s]
 ASIDE = 0.02  # how far an object may be from the reference's place on its path: 0.5 mm of a radius of 25 mm [rad]
 UNSURE = 0.005  # distance from a corner within which angles do not tell its sides: 3 counts of 4096 a turn [rad]
 
@@ -134,9 +134,10 @@ def feedback(
     for group in group_phases(scene):
         options = _motions(scene, group, tables, approaches, trajectory(result), own_motion)
         choices = [[_choose(either[k], tables[k], limit, m) for k, m in zip(group, o, strict=True)] for o in options]
-        best = int(np.argmax([min(float(c.margin.min()) for c in row) for row in choices]))
+        best = max(range(len(choices)), key=lambda option: _worst_first(choices[option]))
         for k, motion, choice in zip(group, options[best], choices[best], strict=True):
             laws.append(_phase_law(scene, k, tables[k], terms[k][0], motion, choice, approaches[k], parts))
+    slow = slowness(scene)
     controller = Controller(
         title=scene.title,
         phases=tuple(laws),
@@ -144,11 +145,16 @@ def feedback(
         integral=integral,
         observer=observer,
         push=_push(scene),
-        felt=FELT,
-        patience=LONGEST_DELAY,
+        felt=(FELT[0] / slow, FELT[1] * slow),
+        patience=LONGEST_DELAY * slow,
         torque_limit=np.asarray(scene.hand.torque_limit),
     )
     return _with_simulated_margins(controller, parts)
+
+
+def _worst_first(choices: list[TorqueChoice]) -> list[float]:
+    """Return the margins of a group's phases, the least first: of motions that have that alike the others decide."""
+    return sorted(float(f"{choice.margin.min():.6g}") for choice in choices)
 
 
 def _require_motions(result: Result, own_motion: bool) -> None:
@@ -207,6 +213,7 @@ def _approaches(
     phase there is nothing to go on to.
     """
     found: list[Approach | None] = []
+    least = APPROACH / slowness(scene)
     rows = zip(scene.phases, traced, tables, stop_places(tables, drawn), strict=True)
     for k, (phase, path, table, stop) in enumerate(rows):
         if phase.arrive is Arrival.MOVING:
@@ -214,9 +221,9 @@ def _approaches(
             found.append(None if is_last else Approach(0.0, 0.0, BEYOND + stop.beyond))
             continue
         length, duration, slow = float(table.s[-1]), float(phase.duration), stop.before
-        speed = max(APPROACH, slow / (SLOW_SHARE * duration))
+        speed = max(least, slow / (SLOW_SHARE * duration))
         if length - slow < speed * (duration - slow / speed):  # it is slow anyway
-            slow, speed = 0.0, APPROACH
+            slow, speed = 0.0, least
         stays = ends_at_stop(scene, phase, path) and stays_at_stop(object_at_stop(scene, phase, path))
         found.append(Approach(slow, speed, max(slow, BEYOND + stop.beyond)) if stays else None)
     return found
@@ -317,7 +324,8 @@ def _phase_law(
     """Put the law of phase `k` together, for the nominal object's `terms` and the stops of all parts with paths."""
     phase = scene.phases[k]
     gain = np.stack([np.interp(table.s, motion.s, choice.gain[:, j]) for j in range(2)], axis=1)
-    flows, press, speed, margin = phase.arrive is Arrival.MOVING, 0.0, APPROACH, float(choice.margin.min())
+    flows, margin = phase.arrive is Arrival.MOVING, float(choice.margin.min())
+    press, speed = 0.0, APPROACH / slowness(scene)
     reach = approach.reach if approach is not None else 0.0
     if approach is not None and not flows:
         stopped = [part for part in parts if has_paths(part.paths[: k + 1])]
@@ -326,7 +334,8 @@ def _phase_law(
         press, gain_at_stop = choose_push(stops, choice.torque[-1], limit, either_finger=either)
         gain[table.s > table.s[-1] - reach] = gain_at_stop
         held = [stop for stop, part in zip(stops, stopped, strict=True) if part.is_held]
-        margin = min(margin, *(stop.pressed_over(choice.torque[-1] + press * gain_at_stop) for stop in held))
+        pressed = choice.torque[-1] + press * gain_at_stop
+        margin = min(margin, *(stop.pressed_over(pressed, either_finger=either) for stop in held))
         speed = approach.speed
     gain /= (gain * terms.acceleration[:, 3:]).sum(1, keepdims=True)
     if approach is not None and flows:  # it goes on as it comes, and nothing bounds the feedback more than on the way

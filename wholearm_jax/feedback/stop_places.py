@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from wholearm_jax.core import Status
 from wholearm_jax.feedback.path_table import PathTable
-from wholearm_jax.model import Scene, remains_simple, rigid_body
+from wholearm_jax.model import Scene, object_radius, remains_simple
 from wholearm_jax.phases import TracedPhase
 
 SHAPES = 12  # parts that are drawn to be held
@@ -33,7 +33,7 @@ def draw_shapes(scenes: list[Scene], shape: float | None, seed: int = 0, count: 
     scene = scenes[0]
     outline = np.asarray(scene.object.vertices)[: int(scene.object.count)]
     if shape is None:
-        shape = RELATIVE_SHAPE * float(np.hypot(*np.asarray(rigid_body(scene.object).vertices).T).max())
+        shape = RELATIVE_SHAPE * object_radius(scene.object)
     if shape == 0:
         return []
     if not remains_simple(outline, np.full(len(outline), np.sqrt(2) * shape)):

@@ -8,12 +8,13 @@ from jaxtyping import Float
 
 from wholearm_jax.feedback.path_table import path_terms, tabulate_path
 from wholearm_jax.margin import Statics, contact_statics
-from wholearm_jax.model import AWAY_NAMES, Phase, Scene
+from wholearm_jax.model import AWAY_NAMES, Phase, Scene, object_radius
 from wholearm_jax.phases import TracedPhase, formation_at_end
 
 LARGEST, TRIED = 60.0, 61  # pushes that are tried [rad/s^2]
 TURNS = np.linspace(-1.2, 1.2, 7)  # their directions against that which accelerates most [rad]
 DECISIVE = 5.0  # least acceleration of the object that is hardest to move, before it stops [rad/s^2]
+FALL = 200.0  # gravity over the radius of objects for which these, and all speeds at stops, are meant [rad/s^2]
 
 
 class StopStatics(NamedTuple):
@@ -21,11 +22,29 @@ class StopStatics(NamedTuple):
 
     statics: Statics
     acceleration: Float[np.ndarray, "5"]  # of `PathTerms`, at the path's end
+    slowness: float  # as `slowness` has it
 
-    def pressed_over(self, torque: Float[np.ndarray, "2"]) -> float:
-        """Return the margin [N] at rest under a torque where that is negative, as it tips the object; else infinity."""
-        margin = self.statics.margin_under(torque).margin
-        return margin if margin < 0 else np.inf
+    def pressed_over(self, torque: Float[np.ndarray, "2"], *, either_finger: bool = True) -> float:
+        """Return by how much a torque does not hold the object at its stop [N], as a negative number; else infinity.
+
+        It is the margin at rest where that is negative, as the torque tips the object, or what a contact of a finger
+        lacks where the torque does not bring it back (`surplus`).
+        """
+        least = self.statics.margin_under(torque).margin
+        if either_finger:
+            least = min(least, float(self.surplus(torque).min()))
+        return least if least < 0 else np.inf
+
+    def surplus(self, torque: Float[np.ndarray, "*torques 2"]) -> Float[np.ndarray, "*torques 2"]:
+        """Return the force [N] at each finger's contact that a torque has beyond the finger's dry friction.
+
+        Where the object stops a finger goes on that moves away from it, and comes back only if this is positive. In
+        `Statics` dry friction helps to hold a contact; a finger that stands away from the object it holds there.
+        """
+        on_joint = self.statics.wrench[3:, : len(self.statics.names)].sum(1)  # what contacts do to the fingers
+        touches = on_joint != 0
+        presses = -np.sign(on_joint) * (torque @ self.statics.load[3:, 1:].T) - self.statics.dry
+        return np.where(touches, presses * self.statics.unit / np.where(touches, np.abs(on_joint), 1.0), np.inf)
 
 
 def object_at_stop(scene: Scene, phase: Phase, path: TracedPhase) -> StopStatics:
@@ -34,7 +53,17 @@ def object_at_stop(scene: Scene, phase: Phase, path: TracedPhase) -> StopStatics
     terms = path_terms(path.dynamics, tabulate_path(path.dynamics))
     statics = contact_statics(scene, closed, end)
     limit = np.where([name in phase.formation.away for name in AWAY_NAMES], 0.0, statics.torque_limit)
-    return StopStatics(replace(statics, torque_limit=limit), terms.acceleration[-1])
+    return StopStatics(replace(statics, torque_limit=limit), terms.acceleration[-1], slowness(scene))
+
+
+def slowness(scene: Scene) -> float:
+    """Return how many times longer an object takes to fall over than one with gravity over radius as `FALL`.
+
+    It is 1 for smaller ones. By so much longer times, and accelerations less by its square, large objects move as small
+    ones do; at the small one's speeds and accelerations they would tip over their stops.
+    """
+    fall = float(np.hypot(*np.asarray(scene.gravity))) / object_radius(scene.object)
+    return max(1.0, np.sqrt(FALL / fall)) if fall > 0 else 1.0
 
 
 def stays_at_stop(stop: StopStatics) -> bool:
@@ -43,7 +72,7 @@ def stays_at_stop(stop: StopStatics) -> bool:
     It cannot where every torque that moves it there moves it on, as where its edge comes to lie along the one finger
     that pushes it, or where it meets a finger that is away. Where the torque limits allow no such push it can.
     """
-    margin = stop.statics.best_against(stop.acceleration[[0, 3, 4]], DECISIVE).margin
+    margin = stop.statics.best_against(stop.acceleration[[0, 3, 4]], DECISIVE / stop.slowness**2).margin
     return margin > 0 or margin == -np.inf
 
 
@@ -60,18 +89,21 @@ def choose_push(
 
     Returns:
         The acceleration [rad/s^2] that the feedback adds at most, and the torques for one of them [N m s^2]. Of all
-        pushes within the torque limits with which every object is accelerated by `DECISIVE`, it is that with the
-        largest margin at rest (the least of all objects); where there are none, that which accelerates most.
+        pushes within the torque limits that bring back fingers and with which every object is accelerated by `DECISIVE`
+        (less where it is large: `slowness`), it is that with the largest margin at rest (the least of all objects);
+        where there are none, that which accelerates most.
     """
     pull = stops[0].acceleration[3:]
     ahead, across = pull / np.hypot(*pull), np.array([-pull[1], pull[0]]) / np.hypot(*pull)
     turns = TURNS if either_finger else np.zeros(1)
     directions = (ahead + np.tan(turns)[:, None] * across) / np.hypot(*pull)
-    pushes = np.linspace(0.0, LARGEST, TRIED)
+    pushes = np.linspace(0.0, LARGEST, TRIED) / stops[0].slowness ** 2
     torques = (torque + pushes[:, None, None] * directions).reshape(-1, 2)
     moves = np.min([stop.acceleration[0] + torques @ stop.acceleration[3:] for stop in stops], axis=0)
     within = np.all(np.abs(torques) <= limit, axis=1)
-    decisive = within & (moves >= DECISIVE)
+    if either_finger and (returns := within & (stops[0].surplus(torques) > 0).all(1)).any():
+        within = returns
+    decisive = within & (moves >= DECISIVE / stops[0].slowness ** 2)
     candidates = np.flatnonzero(decisive)
     if len(candidates):
         chosen = int(candidates[_largest_margin(stops, torques[candidates])])

@@ -50,6 +50,7 @@ from wholearm_jax.model.scene import (
     contact_name,
     feature_pair,
     next_vertex,
+    object_radius,
     parse_contact,
     path_target,
     polygon,

@@ -314,6 +314,11 @@ def rigid_body(shape: Polygon) -> RigidBody:
     )
 
 
+def object_radius(shape: Polygon) -> float:
+    """Return the distance of the farthest vertex from the centre of mass [m]."""
+    return float(np.hypot(*np.asarray(rigid_body(shape).vertices).T).max())
+
+
 def replace_duration(phase: Phase, duration) -> Phase:
     """A phase with another duration."""
     return eqx.tree_at(lambda p: p.duration, phase, as_device_array(duration, float))

@@ -19,6 +19,7 @@ from wholearm_jax.model import (
     contact_set,
     link_obstacles,
     link_overlaps,
+    object_radius,
     rigid_body,
     scaled_mechanics,
 )
@@ -68,7 +69,7 @@ def describe_overlaps(scene: Scene, z: Float[Array | np.ndarray, "5"], tolerance
     Returns:
         A line for each pair, the links among themselves first; empty where nothing overlaps.
     """
-    radius = float(np.hypot(*np.asarray(rigid_body(scene.object).vertices).T).max())
+    radius = object_radius(scene.object)
     between, palm1, palm2, beyond1, beyond2 = (float(v) for v in link_overlaps(scene.hand, z[3:]))
     lines = []
     if between > tolerance * radius:

@@ -22,7 +22,15 @@ import equinox as eqx
 import numpy as np
 
 from wholearm_jax.core import as_device_array, require_x64
-from wholearm_jax.model import ANGLE_COORDINATES, AWAY_NAMES, COORDINATES, Scene, feature_pair, rigid_body
+from wholearm_jax.model import (
+    ANGLE_COORDINATES,
+    AWAY_NAMES,
+    COORDINATES,
+    Scene,
+    feature_pair,
+    object_radius,
+    rigid_body,
+)
 from wholearm_jax.phases import describe_overlaps, possible_hand_overs, trace
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import Move, moves_from
@@ -129,7 +137,7 @@ def plan(
         start=start,
         goal=make_goal(start, goal, by=by, tolerance=tolerance),
         floor=margin,
-        radius=float(np.hypot(*np.asarray(rigid_body(scene.object).vertices).T).max()),
+        radius=object_radius(scene.object),
         max_phases=max_phases,
         duration=duration,
         count=count,
