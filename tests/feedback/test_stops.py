@@ -1,5 +1,6 @@
 """Parts of other shape meet their stops elsewhere: the law comes to them slowly, and goes on to those that are late."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from wholearm_jax.feedback.path_table import tabulate_path
 from wholearm_jax.feedback.reference_motion import passing_motion, smooth_motions
 from wholearm_jax.feedback.stop_places import draw_shapes, stop_places
 from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop
+from wholearm_jax.model import object_radius, rigid_body
 
 SHAPE = 5e-4
 
@@ -130,3 +132,80 @@ def test_parts_of_other_shape_arrive_at_their_own_stops(heptagon):
     amounts = Amounts(friction=0.2, mass=0.1, geometry=SHAPE, start=1e-3)
     trials = run_trials(heptagon, 8, amounts, seed=0, timestep=5e-4, controller=law)
     assert trials.own_successes == 8
+
+
+def larger(scene, size, mass):
+    """The same plan for a part `size` times as large and `mass` times as heavy, in a hand that grows with it."""
+    time, force = np.sqrt(size), mass
+    units = {
+        "joint": size,
+        "length": size,
+        "inertia": mass * size**2,
+        "viscous": force * size * time,
+        "dry": force * size,
+        "torque_limit": force * size,
+    }
+    hand, shape = scene.hand, scene.object
+    return eqx.tree_at(
+        lambda s: (
+            *(getattr(s.hand, name) for name in units),
+            s.object.vertices,
+            s.object.mass,
+            s.start,
+            *(phase.duration for phase in s.phases),
+        ),
+        scene,
+        (
+            *(np.asarray(getattr(hand, name)) * unit for name, unit in units.items()),
+            np.asarray(shape.vertices) * size,
+            np.asarray(shape.mass) * mass,
+            np.asarray(scene.start) * np.array([size, size, 1, 1, 1]),
+            *(np.asarray(phase.duration) * time for phase in scene.phases),
+        ),
+    )
+
+
+def test_a_large_part_moves_as_a_small_one_does():
+    """Lengths times 6, forces times 50, times by the square root of lengths: Froude's similarity of falling bodies."""
+    small = wa.load("heptagon")
+    fall = np.hypot(*np.asarray(small.gravity)) / object_radius(small.object)
+    small = larger(small, fall / stop_torque.FALL, 1.0)  # as large as pushes and speeds are meant for
+    size, mass = 6.0, 50.0
+    laws = []
+    for scene, slow in ((small, 1.0), (larger(small, size, mass), np.sqrt(size))):
+        assert stop_torque.slowness(scene) == pytest.approx(slow, rel=1e-6)
+        rates = {"stiffness": 60.0 / slow, "integral": 10.0 / slow, "observer": 200.0 / slow}
+        laws.append(wa.feedback(scene, wa.quasistatic(scene), friction=0.2, **rates))
+    own, its = laws
+    assert own.margin > 0
+    assert its.felt == pytest.approx((own.felt[0] / slow, own.felt[1] * slow), rel=1e-6)
+    assert its.patience == pytest.approx(own.patience * slow, rel=1e-6)
+    for one, other in zip(own.phases, its.phases, strict=True):
+        assert other.margin == pytest.approx(mass * one.margin, rel=0.01)
+        assert other.approach == pytest.approx(one.approach / slow, rel=1e-6)
+        assert other.press == pytest.approx(one.press / slow**2, rel=1e-6)
+
+
+def test_a_finger_that_its_torque_does_not_bring_back_is_not_at_its_stop(heptagon):
+    """A finger that went on alone comes back only if its torque is more than its dry friction."""
+    dry, path = 0.2, heptagon.phases[0].traced
+    scene = eqx.tree_at(lambda s: s.hand.dry, heptagon.scene, np.full(2, dry))
+    stop = object_at_stop(scene, scene.phases[0], path)
+    weak, strong = np.array([[0.9 * dry, -0.3], [1.1 * dry, -0.3]])
+    assert stop.surplus(weak)[0] < 0 < stop.surplus(strong)[0]
+    assert stop.surplus(strong)[1] == pytest.approx((0.3 - dry) / lever(scene, path, 2), rel=1e-6)
+    assert stop.statics.margin_under(weak).margin > 0, "dry friction would help to hold the contact"
+    assert stop.pressed_over(weak) == pytest.approx(stop.surplus(weak)[0])
+    assert stop.pressed_over(strong) == np.inf
+    assert stop.pressed_over(weak, either_finger=False) == np.inf
+    size, direction = choose_push([stop], weak, np.ones(2), either_finger=True)
+    assert (stop.surplus(weak + size * direction) > 0).all(), "pushes that bring it back are preferred"
+
+
+def lever(scene, path, finger):
+    """How far a finger's contacts at a path's end are from its joint, together [m]."""
+    x, y, phi, *theta = np.asarray(path.end)
+    turn = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]])
+    corners = (np.asarray(rigid_body(scene.object).vertices) @ turn.T) + [x, y]
+    along = np.array([np.cos(theta[finger - 1]), np.sin(theta[finger - 1])])
+    return sum((corners[k] - np.asarray(scene.hand.joint)[finger - 1]) @ along for k in (1, 2))

@@ -21,7 +21,7 @@ from wholearm_jax.feedback.reference_motion import (
 )
 from wholearm_jax.feedback.stop_places import SHAPES_AT_STOPS, draw_shapes, has_paths, stop_places
 from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop, slowness, stays_at_stop
-from wholearm_jax.feedback.torque_choice import TorqueChoice, choose_torques
+from wholearm_jax.feedback.torque_choice import CostUnits, TorqueChoice, choose_torques, cost_units
 from wholearm_jax.model import Arrival, Scene, TorqueSchedule
 from wholearm_jax.phases import (
     CLOSED_LOOP_TOLERANCE,
@@ -127,13 +127,15 @@ def feedback(
         for k, table in enumerate(tables)
     ]
     either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
-    limit = RESERVE * np.asarray(scene.hand.torque_limit)
+    limit, units = RESERVE * np.asarray(scene.hand.torque_limit), cost_units(scene)
     parts = [Part(*each, is_held=True) for each in zip(scenes, traces, strict=True)]
     parts += [Part(*each, is_held=bool(held)) for each in zip(shapes, drawn, strict=True)]
     laws = []
     for group in group_phases(scene):
         options = _motions(scene, group, tables, approaches, trajectory(result), own_motion)
-        choices = [[_choose(either[k], tables[k], limit, m) for k, m in zip(group, o, strict=True)] for o in options]
+        choices = [
+            [_choose(either[k], tables[k], limit, m, units) for k, m in zip(group, o, strict=True)] for o in options
+        ]
         best = max(range(len(choices)), key=lambda option: _worst_first(choices[option]))
         for k, motion, choice in zip(group, options[best], choices[best], strict=True):
             laws.append(_phase_law(scene, k, tables[k], terms[k][0], motion, choice, approaches[k], parts))
@@ -288,12 +290,12 @@ def _with_facets(slack: Float[np.ndarray, "nodes facets 5"], count: int) -> Floa
     return np.take(slack, np.arange(count), axis=1, mode="clip")
 
 
-def _choose(every: list[PathTerms], table: PathTable, limit, motion: ReferenceMotion) -> TorqueChoice:
+def _choose(every: list[PathTerms], table: PathTable, limit, motion: ReferenceMotion, units: CostUnits) -> TorqueChoice:
     """Choose torques and gains at the nodes next to a motion's places."""
     nodes = _nearest(table, motion.s)
     facets = max(terms.slack.shape[1] for terms in every)
     at = [PathTerms(terms.acceleration, _with_facets(terms.slack, facets)).at(nodes) for terms in every]
-    return choose_torques(at, limit, motion.v, motion.a)
+    return choose_torques(at, limit, motion.v, motion.a, units)
 
 
 def corner_scenes(scene: Scene, friction: float, mass: float) -> list[Scene]:

@@ -36,7 +36,7 @@ class StopStatics(NamedTuple):
         return least if least < 0 else np.inf
 
     def surplus(self, torque: Float[np.ndarray, "*torques 2"]) -> Float[np.ndarray, "*torques 2"]:
-        """Return the force [N] at each finger's contact that a torque has beyond the finger's dry friction.
+        """Return the force [N] at each contact of each finger that a torque has beyond the finger's dry friction.
 
         Where the object stops a finger goes on that moves away from it, and comes back only if this is positive. In
         `Statics` dry friction helps to hold a contact; a finger that stands away from the object it holds there.
