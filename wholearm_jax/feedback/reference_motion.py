@@ -51,22 +51,22 @@ def passing_motion(
     last = approach if slow > 0 else exit_
     entry, leaves = (min(v * fast, 2.9 * far) for v in (entry, last))  # so that it never goes back
     cubic = np.polynomial.Polynomial([0.0, entry, 3 * far - 2 * entry - leaves, entry + leaves - 2 * far])
-    return _then_slowly(cubic, fast, duration, last, is_steady=slow > 0 or exit_ == 0)
+    return _then_slowly(cubic, fast, duration, last, keeps_speed=slow > 0 or exit_ == 0)
 
 
 def _then_slowly(
-    place: np.polynomial.Polynomial, fast: float, duration: float, approach: float, is_steady: bool = True
+    place: np.polynomial.Polynomial, fast: float, duration: float, approach: float, keeps_speed: bool = True
 ) -> ReferenceMotion:
     """Return a motion whose place is a polynomial in the share of `fast` [s], and then goes on with one speed.
 
-    Where it `is_steady` at the end, what stands, or goes on, is not braked any more.
+    Where it `keeps_speed` at the end, what stands, or goes on, is not braked any more.
     """
     time = np.linspace(0.0, duration, TIMES)
     u, beyond = np.minimum(time / fast, 1.0), np.maximum(time - fast, 0.0)
     speed, acceleration = place.deriv()(u) / fast, place.deriv(2)(u) / fast**2
-    steady = time > fast
-    steady[-1] = is_steady
-    speed[steady], acceleration[steady] = approach, 0.0
+    constant = time > fast
+    constant[-1] = keeps_speed
+    speed[constant], acceleration[constant] = approach, 0.0
     return ReferenceMotion(time, place(u) + approach * beyond, speed, acceleration)
 
 
