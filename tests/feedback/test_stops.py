@@ -195,9 +195,17 @@ def test_a_finger_that_its_torque_does_not_bring_back_is_not_at_its_stop(heptago
     assert stop.surplus(weak)[0] < 0 < stop.surplus(strong)[0]
     assert stop.surplus(strong)[1] == pytest.approx((0.3 - dry) / lever(scene, path, 2), rel=1e-6)
     assert stop.statics.margin_under(weak).margin > 0, "dry friction would help to hold the contact"
-    assert stop.pressed_over(weak) == pytest.approx(stop.surplus(weak)[0])
-    assert stop.pressed_over(strong) == np.inf
-    assert stop.pressed_over(weak, either_finger=False) == np.inf
+    # It leaves the object at the speed of its joint, and friction and torque brake it evenly.
+    leaves = 8.0 * tabulate_path(path.dynamics).tangent[-1, 0]
+    assert leaves < 0
+    away = float(scene.hand.inertia[0]) * leaves**2 / (2 * 1.9 * dry) * lever(scene, path, 1)
+    assert stop.distances_away(weak, 8.0) == pytest.approx([away, 0.0], rel=1e-6)
+    assert (stop.distances_away(strong, 8.0) == 0).all()
+    assert away > 5e-4
+    assert stop.pressed_over(weak, 8.0) == pytest.approx(stop.surplus(weak)[0])
+    assert stop.pressed_over(weak, 0.15) == np.inf, "it comes to rest next to the object"
+    assert stop.pressed_over(strong, 8.0) == np.inf
+    assert stop.pressed_over(weak, 8.0, either_finger=False) == np.inf
     size, direction = choose_push([stop], weak, np.ones(2), either_finger=True)
     assert (stop.surplus(weak + size * direction) > 0).all(), "pushes that bring it back are preferred"
 
@@ -208,4 +216,5 @@ def lever(scene, path, finger):
     turn = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]])
     corners = (np.asarray(rigid_body(scene.object).vertices) @ turn.T) + [x, y]
     along = np.array([np.cos(theta[finger - 1]), np.sin(theta[finger - 1])])
-    return sum((corners[k] - np.asarray(scene.hand.joint)[finger - 1]) @ along for k in (1, 2))
+    touching = {1: (6,), 2: (1, 2)}[finger]
+    return sum((corners[k] - np.asarray(scene.hand.joint)[finger - 1]) @ along for k in touching)

@@ -337,8 +337,8 @@ def _phase_law(
         gain[table.s > table.s[-1] - reach] = gain_at_stop
         held = [stop for stop, part in zip(stops, stopped, strict=True) if part.is_held]
         pressed = choice.torque[-1] + press * gain_at_stop
-        margin = min(margin, *(stop.pressed_over(pressed, either_finger=either) for stop in held))
         speed = approach.speed
+        margin = min(margin, *(stop.pressed_over(pressed, speed, either_finger=either) for stop in held))
     gain /= (gain * terms.acceleration[:, 3:]).sum(1, keepdims=True)
     if approach is not None and flows:  # it goes on as it comes, and nothing bounds the feedback more than on the way
         press, speed = _push(scene) / float(np.abs(gain).max(1).min()), float(motion.v[-1])

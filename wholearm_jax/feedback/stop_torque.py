@@ -9,7 +9,7 @@ from jaxtyping import Float
 from wholearm_jax.feedback.path_table import path_terms, tabulate_path
 from wholearm_jax.margin import Statics, contact_statics
 from wholearm_jax.model import AWAY_NAMES, Phase, Scene, object_radius
-from wholearm_jax.phases import TracedPhase, formation_at_end
+from wholearm_jax.phases import END_POSITION, TracedPhase, formation_at_end
 
 LARGEST, TRIED = 60.0, 61  # pushes that are tried [rad/s^2]
 TURNS = np.linspace(-1.2, 1.2, 7)  # their directions against that which accelerates most [rad]
@@ -22,17 +22,20 @@ class StopStatics(NamedTuple):
 
     statics: Statics
     acceleration: Float[np.ndarray, "5"]  # of `PathTerms`, at the path's end
+    tangent: Float[np.ndarray, "2"]  # of the curve of joint angles there
+    radius: float  # of the object [m]
     slowness: float  # as `slowness` has it
 
-    def pressed_over(self, torque: Float[np.ndarray, "2"], *, either_finger: bool = True) -> float:
+    def pressed_over(self, torque: Float[np.ndarray, "2"], speed: float, *, either_finger: bool = True) -> float:
         """Return by how much a torque does not hold the object at its stop [N], as a negative number; else infinity.
 
         It is the margin at rest where that is negative, as the torque tips the object, or what a contact of a finger
-        lacks where the torque does not bring it back (`surplus`).
+        lacks where the finger comes to rest away from it, met at a `speed` [rad/s] along the path.
         """
         least = self.statics.margin_under(torque).margin
         if either_finger:
-            least = min(least, float(self.surplus(torque).min()))
+            stays_away = self.distances_away(torque, speed) > END_POSITION
+            least = min(least, float(np.where(stays_away, self.surplus(torque), np.inf).min()))
         return least if least < 0 else np.inf
 
     def surplus(self, torque: Float[np.ndarray, "*torques 2"]) -> Float[np.ndarray, "*torques 2"]:
@@ -41,19 +44,37 @@ class StopStatics(NamedTuple):
         Where the object stops a finger goes on that moves away from it, and comes back only if this is positive. In
         `Statics` dry friction helps to hold a contact; a finger that stands away from the object it holds there.
         """
-        on_joint = self.statics.wrench[3:, : len(self.statics.names)].sum(1)  # what contacts do to the fingers
-        touches = on_joint != 0
-        presses = -np.sign(on_joint) * (torque @ self.statics.load[3:, 1:].T) - self.statics.dry
-        return np.where(touches, presses * self.statics.unit / np.where(touches, np.abs(on_joint), 1.0), np.inf)
+        touches = self._on_joint != 0
+        presses = -np.sign(self._on_joint) * (torque @ self.statics.load[3:, 1:].T) - self.statics.dry
+        return np.where(touches, presses * self.statics.unit / np.where(touches, np.abs(self._on_joint), 1.0), np.inf)
+
+    def distances_away(self, torque: Float[np.ndarray, "2"], speed: float) -> Float[np.ndarray, "2"]:
+        """Return how far from the object each finger comes to rest that goes on where the object stops [m].
+
+        Dry friction and the torque brake it; what viscous friction adds is left out.
+        """
+        closing, statics = -np.sign(self._on_joint), self.statics
+        presses = closing * (statics.load[3:, 1:] @ torque)
+        leaves, brake = np.maximum(-closing * self.tangent * speed, 0.0), statics.dry + presses
+        angle = np.where(brake > 0, statics.mass[3:] * leaves**2 / (2 * np.where(brake > 0, brake, 1.0)), np.inf)
+        angle = np.where((leaves > 0) & (presses <= statics.dry), angle, 0.0)  # else nothing leaves, or it comes back
+        return angle * np.abs(statics.wrench[3:, : len(statics.names)]).max(1) * self.radius
+
+    @property
+    def _on_joint(self) -> Float[np.ndarray, "2"]:
+        """What unit forces of all contacts do to the fingers."""
+        return self.statics.wrench[3:, : len(self.statics.names)].sum(1)
 
 
 def object_at_stop(scene: Scene, phase: Phase, path: TracedPhase) -> StopStatics:
     """Return an object at the end of its path of a phase. A finger that is away has no torque, whatever touches it."""
     closed, end = formation_at_end(scene, phase, path), np.asarray(path.end)
-    terms = path_terms(path.dynamics, tabulate_path(path.dynamics))
+    table = tabulate_path(path.dynamics)
+    terms = path_terms(path.dynamics, table)
     statics = contact_statics(scene, closed, end)
     limit = np.where([name in phase.formation.away for name in AWAY_NAMES], 0.0, statics.torque_limit)
-    return StopStatics(replace(statics, torque_limit=limit), terms.acceleration[-1], slowness(scene))
+    statics, radius = replace(statics, torque_limit=limit), object_radius(scene.object)
+    return StopStatics(statics, terms.acceleration[-1], table.tangent[-1], radius, slowness(scene))
 
 
 def slowness(scene: Scene) -> float:
