@@ -110,9 +110,9 @@ def choose_push(
 
     Returns:
         The acceleration [rad/s^2] that the feedback adds at most, and the torques for one of them [N m s^2]. Of all
-        pushes within the torque limits that bring back fingers and with which every object is accelerated by `DECISIVE`
-        (less where it is large: `slowness`), it is that with the largest margin at rest (the least of all objects);
-        where there are none, that which accelerates most.
+        pushes within the torque limits with which every object is accelerated by `DECISIVE` (less where it is large:
+        `slowness`), and of these where there are any that bring back fingers (`surplus`), it is that with the largest
+        margin at rest (the least of all objects); where none accelerates so much, that which accelerates most.
     """
     pull = stops[0].acceleration[3:]
     ahead, across = pull / np.hypot(*pull), np.array([-pull[1], pull[0]]) / np.hypot(*pull)
@@ -122,9 +122,9 @@ def choose_push(
     torques = (torque + pushes[:, None, None] * directions).reshape(-1, 2)
     moves = np.min([stop.acceleration[0] + torques @ stop.acceleration[3:] for stop in stops], axis=0)
     within = np.all(np.abs(torques) <= limit, axis=1)
-    if either_finger and (returns := within & (stops[0].surplus(torques) > 0).all(1)).any():
-        within = returns
     decisive = within & (moves >= DECISIVE / stops[0].slowness ** 2)
+    if either_finger and (returns := decisive & (stops[0].surplus(torques) > 0).all(1)).any():
+        decisive = returns
     candidates = np.flatnonzero(decisive)
     if len(candidates):
         chosen = int(candidates[_largest_margin(stops, torques[candidates])])
