@@ -51,7 +51,7 @@ def passing_motion(
     last = approach if slow > 0 else exit_
     entry, leaves = (min(v * fast, 2.9 * far) for v in (entry, last))  # so that it never goes back
     cubic = np.polynomial.Polynomial([0.0, entry, 3 * far - 2 * entry - leaves, entry + leaves - 2 * far])
-    return _then_slowly(cubic, fast, duration, last, keeps_speed=slow > 0 or exit_ == 0)
+    return _then_slowly(cubic, fast, duration, last, keeps_speed=bool(slow > 0 or exit_ == 0))
 
 
 def _then_slowly(
