@@ -22,7 +22,7 @@ from planning import GOALS, HANDS, at_rest, first_crossing, objects
 
 import wholearm_jax as wa
 from wholearm_jax.core import as_device_array
-from wholearm_jax.model import COORDINATES, rigid_body
+from wholearm_jax.model import COORDINATES, object_radius
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import Move, moves_from
 from wholearm_jax.planning.plans import Plan, Step, make_plan
@@ -52,7 +52,7 @@ class Reached(NamedTuple):
 
 def explore(scene: wa.Scene, goals: dict[str, Goal], depth: int, places: int, cells: tuple[float, ...]) -> Reached:
     """Go through all moves of up to `depth` phases."""
-    radius = float(np.hypot(*np.asarray(rigid_body(scene.object).vertices).T).max())
+    radius = object_radius(scene.object)
     unit, start = np.array([radius, radius, 1, 1, 1]), np.asarray(scene.start)
     ways: dict[str, dict[tuple, Node]] = {name: {} for name in goals}
     level, nodes, paths = [Node(np.inf, start, (), touching_contacts(scene, as_device_array(start)))], 0, 0

@@ -23,7 +23,7 @@ from random_plans import random_object
 
 import wholearm_jax as wa
 from wholearm_jax.core import as_device_array
-from wholearm_jax.model import COORDINATES, resting_configuration, rigid_body
+from wholearm_jax.model import COORDINATES, object_radius, resting_configuration, rigid_body
 from wholearm_jax.phases import describe_overlaps
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import moves_from
@@ -103,7 +103,7 @@ def random_tree(scene: wa.Scene, by: dict, seconds: float, seed: int, max_phases
     """Grow a random tree over the planner's moves for so many seconds; the best plan that it comes upon, or None."""
     rng, start = np.random.default_rng(seed), np.asarray(scene.start)
     goal: Goal = make_goal(start, by=by)
-    radius = float(np.hypot(*np.asarray(rigid_body(scene.object).vertices).T).max())
+    radius = object_radius(scene.object)
     nodes = [(start, (), touching_contacts(scene, as_device_array(start)))]
     best, end = None, time.monotonic() + seconds
     target_of_goal = start.copy()

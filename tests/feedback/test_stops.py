@@ -32,6 +32,8 @@ def test_a_reference_comes_to_the_end_in_time(slow, approach):
         assert (motion.v >= 0).all()
         late = motion.s > 1.6 - slow
         np.testing.assert_allclose(motion.v[late][:-1], approach, atol=0.05)
+        slow_at = 1.0 - (slow / approach if slow else 0.0)  # a node: the law does not brake there any more
+        assert (motion.a[motion.time >= slow_at - 1e-12] == 0).all()
         steps = np.diff(motion.time)
         np.testing.assert_allclose(np.diff(motion.s), steps * (motion.v[1:] + motion.v[:-1]) / 2, atol=2e-4)
         np.testing.assert_allclose(np.diff(motion.v)[:60], (steps * (motion.a[1:] + motion.a[:-1]) / 2)[:60], atol=1e-2)

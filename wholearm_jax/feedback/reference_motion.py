@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from wholearm_jax.feedback.path_table import PathTable
 from wholearm_jax.phases import Trajectory
@@ -37,7 +37,8 @@ def _profile_motion(p: int, q: int, length: float, duration: float, slow: float,
     rise = np.polynomial.Polynomial([0.0, 0.0, 3.0, -2.0]) * (approach * fast if slow > 0 else 0.0)
     bump = np.polynomial.Polynomial([0.0] * p + [1.0]) * np.polynomial.Polynomial([1.0, -1.0]) ** q
     unit = (length - slow - rise.integ()(1.0)) / bump.integ()(1.0)
-    return _then_slowly((unit * bump + rise).integ(), fast, duration, approach if slow > 0 else 0.0)
+    time, last = np.linspace(0.0, duration, TIMES), approach if slow > 0 else 0.0
+    return _then_slowly((unit * bump + rise).integ(), fast, last, time, time >= fast)
 
 
 def passing_motion(
@@ -51,23 +52,27 @@ def passing_motion(
     last = approach if slow > 0 else exit_
     entry, leaves = (min(v * fast, 2.9 * far) for v in (entry, last))  # so that it never goes back
     cubic = np.polynomial.Polynomial([0.0, entry, 3 * far - 2 * entry - leaves, entry + leaves - 2 * far])
-    return _then_slowly(cubic, fast, duration, last, keeps_speed=bool(slow > 0 or exit_ == 0))
+    time = np.linspace(0.0, duration, TIMES)
+    constant = time > fast
+    constant[-1] = slow > 0 or exit_ == 0  # else it comes to the end as it goes on in the next phase
+    return _then_slowly(cubic, fast, last, time, constant)
 
 
 def _then_slowly(
-    place: np.polynomial.Polynomial, fast: float, duration: float, approach: float, keeps_speed: bool = True
+    place: np.polynomial.Polynomial,
+    fast: float,
+    speed: float,
+    time: Float[np.ndarray, "times"],
+    constant: Bool[np.ndarray, "times"],
 ) -> ReferenceMotion:
-    """Return a motion whose place is a polynomial in the share of `fast` [s], and then goes on with one speed.
+    """Return a motion whose place is a polynomial in the share of `fast` [s], then goes on with one `speed` [rad/s].
 
-    Where it `keeps_speed` at the end, what stands, or goes on, is not braked any more.
+    At times that are `constant` it is not braked any more.
     """
-    time = np.linspace(0.0, duration, TIMES)
     u, beyond = np.minimum(time / fast, 1.0), np.maximum(time - fast, 0.0)
-    speed, acceleration = place.deriv()(u) / fast, place.deriv(2)(u) / fast**2
-    constant = time > fast
-    constant[-1] = keeps_speed
-    speed[constant], acceleration[constant] = approach, 0.0
-    return ReferenceMotion(time, place(u) + approach * beyond, speed, acceleration)
+    v = np.where(constant, speed, place.deriv()(u) / fast)
+    a = np.where(constant, 0.0, place.deriv(2)(u) / fast**2)
+    return ReferenceMotion(time, place(u) + speed * beyond, v, a)
 
 
 def scheduled_motion(table: PathTable, course: Trajectory) -> ReferenceMotion:

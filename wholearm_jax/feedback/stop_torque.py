@@ -45,25 +45,33 @@ class StopStatics(NamedTuple):
         `Statics` dry friction helps to hold a contact; a finger that stands away from the object it holds there.
         """
         touches = self._on_joint != 0
-        presses = -np.sign(self._on_joint) * (torque @ self.statics.load[3:, 1:].T) - self.statics.dry
-        return np.where(touches, presses * self.statics.unit / np.where(touches, np.abs(self._on_joint), 1.0), np.inf)
+        force = self._presses(torque) - self.statics.dry
+        return np.where(touches, force * self.statics.unit / np.where(touches, np.abs(self._on_joint), 1.0), np.inf)
 
     def distances_away(self, torque: Float[np.ndarray, "2"], speed: float) -> Float[np.ndarray, "2"]:
         """Return how far from the object each finger comes to rest that goes on where the object stops [m].
 
         Dry friction and the torque brake it; what viscous friction adds is left out.
         """
-        closing, statics = -np.sign(self._on_joint), self.statics
-        presses = closing * (statics.load[3:, 1:] @ torque)
-        leaves, brake = np.maximum(-closing * self.tangent * speed, 0.0), statics.dry + presses
+        statics, leaves = self.statics, np.maximum(np.sign(self._on_joint) * self.tangent * speed, 0.0)
+        brake = statics.dry + self._presses(torque)
         angle = np.where(brake > 0, statics.mass[3:] * leaves**2 / (2 * np.where(brake > 0, brake, 1.0)), np.inf)
-        angle = np.where((leaves > 0) & (presses <= statics.dry), angle, 0.0)  # else nothing leaves, or it comes back
+        angle = np.where((leaves > 0) & (self.surplus(torque) <= 0), angle, 0.0)  # else nothing leaves, or comes back
         return angle * np.abs(statics.wrench[3:, : len(statics.names)]).max(1) * self.radius
+
+    def _presses(self, torque: Float[np.ndarray, "*torques 2"]) -> Float[np.ndarray, "*torques 2"]:
+        """Return what a torque presses each finger toward the object with, in the unit of `Statics.dry`."""
+        return -np.sign(self._on_joint) * (torque @ self.statics.load[3:, 1:].T)
 
     @property
     def _on_joint(self) -> Float[np.ndarray, "2"]:
         """What unit forces of all contacts do to the fingers."""
         return self.statics.wrench[3:, : len(self.statics.names)].sum(1)
+
+    @property
+    def decisive(self) -> float:
+        """Least acceleration of the object that is hardest to move, before it stops [rad/s^2]."""
+        return DECISIVE / self.slowness**2
 
 
 def object_at_stop(scene: Scene, phase: Phase, path: TracedPhase) -> StopStatics:
@@ -93,7 +101,7 @@ def stays_at_stop(stop: StopStatics) -> bool:
     It cannot where every torque that moves it there moves it on, as where its edge comes to lie along the one finger
     that pushes it, or where it meets a finger that is away. Where the torque limits allow no such push it can.
     """
-    margin = stop.statics.best_against(stop.acceleration[[0, 3, 4]], DECISIVE / stop.slowness**2).margin
+    margin = stop.statics.best_against(stop.acceleration[[0, 3, 4]], stop.decisive).margin
     return margin > 0 or margin == -np.inf
 
 
@@ -122,7 +130,7 @@ def choose_push(
     torques = (torque + pushes[:, None, None] * directions).reshape(-1, 2)
     moves = np.min([stop.acceleration[0] + torques @ stop.acceleration[3:] for stop in stops], axis=0)
     within = np.all(np.abs(torques) <= limit, axis=1)
-    decisive = within & (moves >= DECISIVE / stops[0].slowness ** 2)
+    decisive = within & (moves >= stops[0].decisive)
     if either_finger and (returns := decisive & (stops[0].surplus(torques) > 0).all(1)).any():
         decisive = returns
     candidates = np.flatnonzero(decisive)
