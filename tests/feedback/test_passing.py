@@ -85,7 +85,8 @@ def test_a_schedule_whose_motion_fails_gives_no_speeds_to_pass_with(passage):
         wa.feedback(passage.scene, wa.quasistatic(passage.scene))
     heptagon = wa.load("heptagon")
     idle = uniform_schedule(2.0, np.zeros((2, 2)))
-    wa.feedback(heptagon, idle, friction=0.0)  # the motion is the law's own
+    law = wa.feedback(heptagon, idle, friction=0.0, stiffness=40.0)  # the motion is the law's own
+    assert (law.stiffness, law.integral, law.observer) == (40.0, 10.0, 200.0)
     with pytest.raises(ValueError, match=r"follow the schedule.s motion.*has to succeed"):
         wa.feedback(heptagon, idle, friction=0.0, own_motion=True)
 

@@ -176,10 +176,11 @@ def test_a_large_part_moves_as_a_small_one_does():
     laws = []
     for scene, slow in ((small, 1.0), (larger(small, size, mass), np.sqrt(size))):
         assert stop_torque.slowness(scene) == pytest.approx(slow, rel=1e-6)
-        rates = {"stiffness": 60.0 / slow, "integral": 10.0 / slow, "observer": 200.0 / slow}
-        laws.append(wa.feedback(scene, wa.quasistatic(scene), friction=0.2, **rates))
+        laws.append(wa.feedback(scene, wa.quasistatic(scene), friction=0.2))
     own, its = laws
     assert own.margin > 0
+    assert (own.stiffness, own.integral, own.observer) == pytest.approx((60.0, 10.0, 200.0), rel=1e-6)
+    assert (its.stiffness, its.integral, its.observer) == pytest.approx((60.0 / slow, 10.0 / slow, 200.0 / slow))
     assert its.felt == pytest.approx((own.felt[0] / slow, own.felt[1] * slow), rel=1e-6)
     assert its.patience == pytest.approx(own.patience * slow, rel=1e-6)
     for one, other in zip(own.phases, its.phases, strict=True):

@@ -38,10 +38,11 @@ from wholearm_jax.phases import (
 )
 from wholearm_jax.simulation import IntegratorOptions
 
+RATES = {"stiffness": 60.0, "integral": 10.0, "observer": 200.0}  # of an object that is not large (`slowness`) [1/s]
 RESERVE = 0.9  # fraction of the torque limits that the reference's torques and their corrections stay within
 PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
 BEYOND = 0.06  # how far the reference goes on beyond the path's end, to meet the contact that ends it [rad]
-APPROACH = 0.15  # speed with which, at least, of an object that is not large (`slowness`) [rad/s]
+APPROACH = 0.15  # speed with which, at least, of an object that is not large [rad/s]
 SLOW_SHARE = 0.4  # of a phase's duration, at most, that the reference takes to cross where stops of other parts may be
 FELT = (0.05, 0.03)  # speed [rad/s] below which such an object stands, and for how long [s]
 LONGEST_DELAY = 1.0  # longest time beyond a phase's duration, for such an object [s]
@@ -71,9 +72,9 @@ def feedback(
     *,
     friction: float = 0.2,
     mass: float = 0.0,
-    stiffness: float = 60.0,
-    integral: float = 10.0,
-    observer: float = 200.0,
+    stiffness: float | None = None,
+    integral: float | None = None,
+    observer: float | None = None,
     shape: float | None = None,
     own_motion: bool = False,
 ) -> Controller:
@@ -90,9 +91,10 @@ def feedback(
             one another without a stop.
         friction: Half width of each link's friction, relative.
         mass: Half width of the mass, relative.
-        stiffness: Natural frequency `w` of the loop [1/s].
-        integral: Rate of its integral part [1/s].
-        observer: Rate of the filter for place and speed [1/s].
+        stiffness: Natural frequency `w` of the loop [1/s], 60 unless given; less for a large object (`slowness`), as
+            the other rates.
+        integral: Rate of its integral part [1/s], 10 unless given.
+        observer: Rate of the filter for place and speed [1/s], 200 unless given.
         shape: Half width of the vertices' coordinates [m] of parts that have to be held, too. Phases that end at a stop
             approach it slowly from where that of such a part may be, first, and go on to where it may be, last; for
             that alone it is 1 % of the object's radius unless given.
@@ -105,7 +107,10 @@ def feedback(
         ValueError: For numbers that are out of range, for a plan whose paths cannot be traced, where both joints stand
             still on a path, and where a schedule fails whose motion is asked for.
     """
-    require_positive(stiffness=stiffness, integral=integral, observer=observer)
+    slow = slowness(scene)
+    given = {"stiffness": stiffness, "integral": integral, "observer": observer}
+    rates = {name: RATES[name] / slow if rate is None else rate for name, rate in given.items()}
+    require_positive(**rates)
     if not (0 <= friction < 1 and 0 <= mass < 1):
         raise ValueError("friction, mass: shares of at least 0 and less than 1")
     require_motion(scene)
@@ -139,13 +144,10 @@ def feedback(
         best = max(range(len(choices)), key=lambda option: _worst_first(choices[option]))
         for k, motion, choice in zip(group, options[best], choices[best], strict=True):
             laws.append(_phase_law(scene, k, tables[k], terms[k][0], motion, choice, approaches[k], parts))
-    slow = slowness(scene)
     controller = Controller(
         title=scene.title,
         phases=tuple(laws),
-        stiffness=stiffness,
-        integral=integral,
-        observer=observer,
+        **rates,
         push=_push(scene),
         felt=(FELT[0] / slow, FELT[1] * slow),
         patience=LONGEST_DELAY * slow,
