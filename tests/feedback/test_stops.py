@@ -1,5 +1,7 @@
 """Parts of other shape meet their stops elsewhere: the law comes to them slowly, and goes on to those that are late."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import numpy as np
 import pytest
@@ -187,6 +189,18 @@ def test_a_large_part_moves_as_a_small_one_does():
         assert other.margin == pytest.approx(mass * one.margin, rel=0.01)
         assert other.approach == pytest.approx(one.approach / slow, rel=1e-6)
         assert other.press == pytest.approx(one.press / slow**2, rel=1e-6)
+
+
+def test_a_slow_motion_has_a_law_that_an_encoder_does_not_reverse(heptagon):
+    """With the rates of a fast one the loop could not be followed, nor did executions keep their contacts."""
+    slow = [replace(phase, duration=12.0 * phase.duration) for phase in heptagon.scene.phases]
+    scene = replace(heptagon.scene, phases=tuple(slow))
+    law = wa.feedback(scene, wa.quasistatic(scene), friction=0.2)
+    assert law.margin > 0.3
+    slowest = min(float(phase.s[-1]) for phase in law.phases) / 12.0
+    by_a_step = law.stiffness * 2 * np.pi / 4096
+    assert by_a_step == pytest.approx(1.2 * slowest, rel=1e-6)
+    assert (law.integral, law.observer) == pytest.approx((law.stiffness / 6, law.stiffness / 0.3), rel=1e-6)
 
 
 def test_a_finger_that_its_torque_does_not_bring_back_is_not_at_its_stop(heptagon):

@@ -39,6 +39,8 @@ from wholearm_jax.phases import (
 from wholearm_jax.simulation import IntegratorOptions
 
 RATES = {"stiffness": 60.0, "integral": 10.0, "observer": 200.0}  # of an object that is not large (`slowness`) [1/s]
+ENCODER_STEP = 2 * np.pi / 4096  # of angles as executions measure them unless told otherwise [rad]
+HASTE = 1.2  # largest speed that such a step causes, over the mean speed of the slowest phase
 RESERVE = 0.9  # fraction of the torque limits that the reference's torques and their corrections stay within
 PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
 BEYOND = 0.06  # how far the reference goes on beyond the path's end, to meet the contact that ends it [rad]
@@ -91,8 +93,8 @@ def feedback(
             one another without a stop.
         friction: Half width of each link's friction, relative.
         mass: Half width of the mass, relative.
-        stiffness: Natural frequency `w` of the loop [1/s], 60 unless given; less for a large object (`slowness`), as
-            the other rates.
+        stiffness: Natural frequency `w` of the loop [1/s], 60 unless given; less for a large object or a slow motion,
+            as the other rates.
         integral: Rate of its integral part [1/s], 10 unless given.
         observer: Rate of the filter for place and speed [1/s], 200 unless given.
         shape: Half width of the vertices' coordinates [m] of parts that have to be held, too. Phases that end at a stop
@@ -107,10 +109,9 @@ def feedback(
         ValueError: For numbers that are out of range, for a plan whose paths cannot be traced, where both joints stand
             still on a path, and where a schedule fails whose motion is asked for.
     """
-    slow = slowness(scene)
-    given = {"stiffness": stiffness, "integral": integral, "observer": observer}
-    rates = {name: RATES[name] / slow if rate is None else rate for name, rate in given.items()}
-    require_positive(**rates)
+    rates = {"stiffness": stiffness, "integral": integral, "observer": observer}
+    given = {name: rate for name, rate in rates.items() if rate is not None}
+    require_positive(**given)
     if not (0 <= friction < 1 and 0 <= mass < 1):
         raise ValueError("friction, mass: shares of at least 0 and less than 1")
     require_motion(scene)
@@ -144,16 +145,27 @@ def feedback(
         best = max(range(len(choices)), key=lambda option: _worst_first(choices[option]))
         for k, motion, choice in zip(group, options[best], choices[best], strict=True):
             laws.append(_phase_law(scene, k, tables[k], terms[k][0], motion, choice, approaches[k], parts))
+    slow = slowness(scene)
     controller = Controller(
         title=scene.title,
         phases=tuple(laws),
-        **rates,
+        **_default_rates(scene, tables) | given,
         push=_push(scene),
         felt=(FELT[0] / slow, FELT[1] * slow),
         patience=LONGEST_DELAY * slow,
         torque_limit=np.asarray(scene.hand.torque_limit),
     )
     return _with_simulated_margins(controller, parts)
+
+
+def _default_rates(scene: Scene, tables: list[PathTable]) -> dict[str, float]:
+    """Return the loop's rates: less for large objects, and for motions so slow that an encoder's steps reverse them.
+
+    Each step of the measured angle moves the object at about `w` times the step.
+    """
+    slowest = min(float(table.s[-1] / phase.duration) for table, phase in zip(tables, scene.phases, strict=True))
+    share = min(1 / slowness(scene), HASTE * slowest / (ENCODER_STEP * RATES["stiffness"]))
+    return {name: share * rate for name, rate in RATES.items()}
 
 
 def _worst_first(choices: list[TorqueChoice]) -> list[float]:
