@@ -45,12 +45,14 @@ from wholearm_jax.planning.plans import (
 )
 from wholearm_jax.planning.regrasps import regrasp_stops, separate_regrasps
 from wholearm_jax.planning.successors import touching_contacts
+from wholearm_jax.tracing import PathEnd
 
 STOPS = {  # fractions of a path at which other moves may begin, and by how many phases later they are tried
     **dict.fromkeys((1 / 3, 2 / 3), 0.0),
     **dict.fromkeys((1 / 6, 1 / 2, 5 / 6), 1.0),
     **dict.fromkeys((1 / 12, 1 / 4, 5 / 12, 7 / 12, 3 / 4, 11 / 12), 2.0),
 }
+AT_TIP = 3.0  # by how many phases later an arrival is taken at which a contact leaves its feature, as at a tip
 MERGE_TOL = 1e-5  # configurations closer than this, in object radii and radians, are one node
 TYPICAL_SHIFT, TYPICAL_TURN = 0.5, 0.5  # of one move [object radii, rad], for the estimate of phases to come
 SHORT_PLAN = 5  # phases
@@ -322,12 +324,17 @@ def _names(move: Move) -> tuple[str, ...]:
 
 
 def _stops(search: _Search, move: Move) -> Iterator[tuple[Step, bool]]:
-    """Yield the places at which a move may be left: its end, the goal's coordinates, and a few between."""
+    """Yield the places at which a move may be left: the goal's coordinates, its end, and a few between.
+
+    Of two that reach the goal the search takes the first: where a path meets the goal itself, not its end nearby.
+    """
     lowest = np.minimum.accumulate(move.margins)
     last = len(move.places) - 1
-    yield Step(move.contacts, move.toward, None, move.places[last], float(lowest[last])), True
     for name, value in search.goal.values.items():
         yield from _crossings(move, lowest, name, value)
+    end = move.places[last]
+    leaves = move.end_reason == PathEnd.FEATURE_END and search.goal.is_reached(end)
+    yield Step(move.contacts, move.toward, None, end, float(lowest[last]), delay=AT_TIP if leaves else 0.0), True
     displacement = np.abs(move.places[last] - move.places[0]) / np.array([search.radius, search.radius, 1, 1, 1])
     name = COORDINATES[int(np.argmax(displacement))]
     for fraction, delay in STOPS.items():
