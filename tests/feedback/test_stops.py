@@ -95,6 +95,28 @@ def test_the_push_at_a_stop_has_the_largest_margin_of_all_that_move_every_object
     assert tried > 10
 
 
+def test_a_push_squeezes_an_object_that_milder_ones_tip(heptagon, monkeypatch):
+    """Where it is to be moved by 16 rad/s^2, with torques that hold it loosely until then."""
+    monkeypatch.setattr(stop_torque, "DECISIVE", 16.0)
+    scene, phase, path = heptagon.scene, heptagon.scene.phases[1], heptagon.phases[1].traced
+    stop, torque = object_at_stop(scene, phase, path), np.array([0.031, -0.045])
+    assert stop.statics.margin_under(torque).margin > 0
+    pull = stop.acceleration[3:]
+    ahead, across = pull / np.hypot(*pull), np.array([-pull[1], pull[0]]) / np.hypot(*pull)
+    for turn in np.linspace(-1.2, 1.2, 7):
+        direction = ahead + np.tan(turn) * across
+        least = (16.0 - stop.acceleration[0] - torque @ pull) / (direction @ pull)
+        for size in least * np.array([1.0, 1.5, 3.0]):
+            assert stop.statics.margin_under(torque + size * direction).margin < 0
+    push, direction = choose_push([stop], torque, np.ones(2), either_finger=True)
+    pressed = torque + push * direction
+    assert stop.acceleration[0] + pressed @ pull >= 16.0
+    assert (np.abs(pressed) <= 1.0).all()
+    assert stop.statics.margin_under(pressed).margin > 0
+    alone = choose_push([stop], torque, np.ones(2), either_finger=False)
+    np.testing.assert_allclose(alone[1] / np.hypot(*alone[1]), ahead, err_msg="one finger alone has no choice")
+
+
 def test_a_push_that_tips_objects_over_their_stop_makes_the_margin_negative(heptagon, monkeypatch):
     """Where every object is to be moved by no less than 16 rad/s^2, one of the set does not stay at its stop."""
     scene, torque = heptagon.scene, heptagon.torque

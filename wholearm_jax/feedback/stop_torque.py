@@ -13,6 +13,7 @@ from wholearm_jax.phases import END_POSITION, TracedPhase, formation_at_end
 
 LARGEST, TRIED = 60.0, 61  # pushes that are tried [rad/s^2]
 TURNS = np.linspace(-1.2, 1.2, 7)  # their directions against that which accelerates most [rad]
+STEEP_TURNS = np.array([-1.5, -1.4, -1.3, 1.3, 1.4, 1.5])  # further ones, which mostly squeeze, if the others fail
 DECISIVE = 5.0  # least acceleration of the object that is hardest to move, before it stops [rad/s^2]
 FALL = 200.0  # gravity over the radius of objects for which these, and all speeds at stops, are meant [rad/s^2]
 
@@ -105,6 +106,12 @@ def stays_at_stop(stop: StopStatics) -> bool:
     return margin > 0 or margin == -np.inf
 
 
+class _Push(NamedTuple):
+    size: float  # [rad/s^2]
+    direction: Float[np.ndarray, "2"]  # [N m s^2]
+    margin: float  # at rest under it, the least of all objects [N]; NaN where no push is decisive
+
+
 def choose_push(
     stops: list[StopStatics], torque: Float[np.ndarray, "2"], limit: Float[np.ndarray, "2"], *, either_finger: bool
 ) -> tuple[float, Float[np.ndarray, "2"]]:
@@ -120,30 +127,39 @@ def choose_push(
         The acceleration [rad/s^2] that the feedback adds at most, and the torques for one of them [N m s^2]. Of all
         pushes within the torque limits with which every object is accelerated by `DECISIVE` (less where it is large:
         `slowness`), and of these where there are any that bring back fingers (`surplus`), it is that with the largest
-        margin at rest (the least of all objects); where none accelerates so much, that which accelerates most.
+        margin at rest (the least of all objects). Where that is negative, pushes that squeeze the object more are
+        tried as well; where none accelerates so much, it is that which accelerates most.
     """
+    push = _push_within(stops, torque, limit, TURNS if either_finger else np.zeros(1))
+    if either_finger and push.margin <= 0:  # one that squeezes the object more may hold it
+        push = max(push, _push_within(stops, torque, limit, STEEP_TURNS), key=lambda one: one.margin)
+    return push.size, push.direction
+
+
+def _push_within(stops: list[StopStatics], torque, limit, turns: Float[np.ndarray, "turns"]) -> _Push:
+    """Choose the best push of those whose directions have these angles against that which accelerates most."""
     pull = stops[0].acceleration[3:]
     ahead, across = pull / np.hypot(*pull), np.array([-pull[1], pull[0]]) / np.hypot(*pull)
-    turns = TURNS if either_finger else np.zeros(1)
     directions = (ahead + np.tan(turns)[:, None] * across) / np.hypot(*pull)
     pushes = np.linspace(0.0, LARGEST, TRIED) / stops[0].slowness ** 2
     torques = (torque + pushes[:, None, None] * directions).reshape(-1, 2)
     moves = np.min([stop.acceleration[0] + torques @ stop.acceleration[3:] for stop in stops], axis=0)
     within = np.all(np.abs(torques) <= limit, axis=1)
     decisive = within & (moves >= stops[0].decisive)
-    if either_finger and (returns := decisive & (stops[0].surplus(torques) > 0).all(1)).any():
+    if len(turns) > 1 and (returns := decisive & (stops[0].surplus(torques) > 0).all(1)).any():
         decisive = returns
     candidates = np.flatnonzero(decisive)
     if len(candidates):
-        chosen = int(candidates[_largest_margin(stops, torques[candidates])])
+        best, margin = _largest_margin(stops, torques[candidates])
+        chosen = int(candidates[best])
     else:
-        chosen = int(np.argmax(np.where(within, moves, -np.inf)))
-    push, turn = divmod(chosen, len(turns))
-    return float(pushes[push]), directions[turn]
+        chosen, margin = int(np.argmax(np.where(within, moves, -np.inf))), np.nan
+    size, turn = divmod(chosen, len(turns))
+    return _Push(float(pushes[size]), directions[turn], margin)
 
 
-def _largest_margin(stops: list[StopStatics], torques: Float[np.ndarray, "torques 2"]) -> int:
-    """Return which torque has the largest margin at rest, the least of all objects.
+def _largest_margin(stops: list[StopStatics], torques: Float[np.ndarray, "torques 2"]) -> tuple[int, float]:
+    """Return which torque has the largest margin at rest, the least of all objects, and that margin [N].
 
     The nominal object's bounds it, so that few torques are asked of all objects, the one that ruled out the last first.
     """
@@ -160,4 +176,4 @@ def _largest_margin(stops: list[StopStatics], torques: Float[np.ndarray, "torque
                 break
         else:
             chosen, best = int(k), margin
-    return chosen
+    return chosen, float(best)
