@@ -105,3 +105,16 @@ def test_the_command_refuses_them_in_one_line(text, wholearm):
     code, out, err = wholearm("execute", "heptagon", "--torque", TORQUE, "--push", text)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert f"--push {text}: write COORDINATE=IMPULSE@TIME" in err
+
+
+def test_the_command_says_when_an_encoder_may_have_opened_contacts(controller, wholearm, tmp_path):
+    wa.write_controller(controller, tmp_path / "controller.json")
+    options = ("--controller", tmp_path / "controller.json", "--perturb", "1", "--timestep", "0.001")
+    _, out, err = wholearm("execute", "heptagon", *options, "--counts", "300")
+    assert "all contacts kept on the way: 0" in out
+    assert "though the law's least force is 0.347 N" in err
+    assert "--counts 1200 tells" in err
+    assert "stiffness=30, integral=5, observer=100" in err
+    _, out, err = wholearm("execute", "heptagon", *options, "--counts", "0")
+    assert "all contacts kept on the way: 1" in out
+    assert "encoder" not in err

@@ -107,6 +107,7 @@ def execute(
     else:
         _print_execution(execution, trials, folder)
     _note_astray(prediction, law, execution)
+    _note_lost_contacts(law, hardware, trials)
     sys.exit(0 if ok else 1)
 
 
@@ -179,6 +180,21 @@ def _note_astray(prediction, law, execution) -> None:
         f"open loop nothing corrects the object{must}; a law does: wholearm optimise SCENE --feedback --out DIR,"
         " then execute it with --controller DIR/controller.json; --timestep"
         f" {execution.timestep / 4:g} says whether only this simulation's steps are too long"
+    )
+
+
+def _note_lost_contacts(law, hardware, trials) -> None:
+    """Where perturbed objects lose contacts that their law keeps, say how to tell whether the encoders do it."""
+    if law is None or trials is None or law.margin <= 0 or hardware.counts == 0:
+        return
+    lost = sum(run.least_force <= 0 for run in trials.runs)
+    if not lost:
+        return
+    rates = ", ".join(f"{name}={getattr(law, name) / 2:.3g}" for name in ("stiffness", "integral", "observer"))
+    note(
+        f"a contact opened on the way in {lost} of {len(trials.runs)}, though the law's least force is"
+        f" {law.margin:.3g} N: an encoder's steps may do so. --counts {4 * hardware.counts} tells; if it is they, a law"
+        f" with lower rates follows them less: wa.feedback(scene, torque, {rates})"
     )
 
 
