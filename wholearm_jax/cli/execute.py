@@ -87,17 +87,13 @@ def execute(
         if as_json:
             print_json({"prediction": {"status": prediction.status.label, "message": prediction.message}})
         sys.exit(1)
-    settings = {"timestep": timestep, "tolerance": Tolerance(position, angle), "controller": law, "hardware": hardware}
-    settings |= {"pushes": pushes}
+    settings = {"timestep": timestep, "tolerance": Tolerance(position, angle), "pushes": pushes}
+    settings |= {"controller": law, "hardware": hardware}
     execution = rollout(prediction, seed=seed, **settings)
     _note_late_pushes(push or [], pushes, float(execution.course.time[-1]))
     trials = _run_trials(prediction, perturb, amounts, seed=seed, **settings) if perturb else None
-    more: dict[str, Any] = {"torque": str(torque)}
-    if law is not None:
-        least = {"least_force": law.margin}
-        more = {"prediction": least, "controller": str(controller), "hardware": hardware._asdict()}
-    more |= {"pushes": [dict(one._asdict(), impulse=one.impulse.tolist()) for one in pushes]} if pushes else {}
-    content = execution_summary(execution, trials, **more)
+    driven_by = _torque_source(torque, controller, law, hardware)
+    content = execution_summary(execution, trials, **driven_by, **_as_data(pushes))
     ok = execution.ending is ExecutionOutcome.OK
     folder = folder if folder and may_replace(folder, EXECUTION_FILES, ok) else None
     if folder is not None:
@@ -106,9 +102,24 @@ def execute(
         print_json(content)
     else:
         _print_execution(execution, trials, folder)
-    _note_astray(prediction, law, execution)
-    _note_lost_contacts(law, hardware, trials)
+    if law is None:
+        _note_astray(prediction, execution)
+    else:
+        _note_lost_contacts(law, hardware, trials)
     sys.exit(0 if ok else 1)
+
+
+def _torque_source(torque: Path | None, controller: Path | None, law, hardware) -> dict[str, Any]:
+    """Return what execution.json says about where torques come from: a schedule, or a controller and its hardware."""
+    if law is None:
+        return {"torque": str(torque)}
+    least = {"least_force": law.margin}
+    return {"prediction": least, "controller": str(controller), "hardware": hardware._asdict()}
+
+
+def _as_data(pushes) -> dict[str, Any]:
+    """Return what execution.json says about pushes: nothing where there are none."""
+    return {"pushes": [dict(one._asdict(), impulse=one.impulse.tolist()) for one in pushes]} if pushes else {}
 
 
 def _note_late_pushes(texts: list[str], pushes, end: float) -> None:
@@ -168,11 +179,11 @@ def _print_execution(execution, trials, folder: Path | None) -> None:
     print(f"executed: {execution.message}" + (f" -> {folder}" if folder else ""))
 
 
-def _note_astray(prediction, law, execution) -> None:
+def _note_astray(prediction, execution) -> None:
     """Where the object goes astray without a law, say how exact torques must be, and what helps."""
     from wholearm_jax.phases import torque_accuracy
 
-    if law is not None or execution.ending.value != "astray":
+    if execution.ending.value != "astray":
         return
     accuracy = min((one for one in torque_accuracy(prediction) if one > 0), default=float("inf"))  # NaN left out
     must = f", and torques would have to be right to {100 * accuracy:.2g} %" if accuracy < 1 else ""
@@ -185,7 +196,7 @@ def _note_astray(prediction, law, execution) -> None:
 
 def _note_lost_contacts(law, hardware, trials) -> None:
     """Where perturbed objects lose contacts that their law keeps, say how to tell whether the encoders do it."""
-    if law is None or trials is None or law.margin <= 0 or hardware.counts == 0:
+    if trials is None or law.margin <= 0 or hardware.counts == 0:
         return
     lost = sum(run.least_force <= 0 for run in trials.runs)
     if not lost:
