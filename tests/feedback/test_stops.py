@@ -9,7 +9,7 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax.execution import Amounts, run_trials
 from wholearm_jax.feedback import feedback, stop_torque
-from wholearm_jax.feedback.design import corner_scenes
+from wholearm_jax.feedback.design import _default_rates, corner_scenes
 from wholearm_jax.feedback.path_table import tabulate_path
 from wholearm_jax.feedback.reference_motion import passing_motion, smooth_motions
 from wholearm_jax.feedback.stop_places import draw_shapes, stop_places
@@ -213,16 +213,30 @@ def test_a_large_part_moves_as_a_small_one_does():
         assert other.press == pytest.approx(one.press / slow**2, rel=1e-6)
 
 
+def lasting(scene, *durations):
+    """The same plan with other durations [s]."""
+    phases = zip(scene.phases, durations, strict=True)
+    return replace(scene, phases=tuple(replace(phase, duration=np.asarray(time)) for phase, time in phases))
+
+
 def test_a_slow_motion_has_a_law_that_an_encoder_does_not_reverse(heptagon):
     """With the rates of a fast one the loop could not be followed, nor did executions keep their contacts."""
-    slow = [replace(phase, duration=12.0 * phase.duration) for phase in heptagon.scene.phases]
-    scene = replace(heptagon.scene, phases=tuple(slow))
+    scene = lasting(heptagon.scene, 12.0, 12.0)
     law = wa.feedback(scene, wa.quasistatic(scene), friction=0.2)
     assert law.margin > 0.3
     slowest = min(float(phase.s[-1]) for phase in law.phases) / 12.0
     by_a_step = law.stiffness * 2 * np.pi / 4096
     assert by_a_step == pytest.approx(1.2 * slowest, rel=1e-6)
     assert (law.integral, law.observer) == pytest.approx((law.stiffness / 6, law.stiffness / 0.3), rel=1e-6)
+
+
+def test_a_loop_settles_within_the_shortest_phase(heptagon):
+    """A slow phase lowers the rates only so far."""
+    tables = [tabulate_path(phase.traced.dynamics) for phase in heptagon.phases]
+    brief = _default_rates(lasting(heptagon.scene, 20.0, 0.8), tables)
+    assert brief["stiffness"] == pytest.approx(20.0 / 0.8, rel=1e-12)
+    usual = _default_rates(lasting(heptagon.scene, 20.0, 0.1), tables)
+    assert usual == {"stiffness": 60.0, "integral": 10.0, "observer": 200.0}
 
 
 def test_a_finger_that_its_torque_does_not_bring_back_is_not_at_its_stop(heptagon):

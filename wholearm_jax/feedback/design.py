@@ -41,6 +41,7 @@ from wholearm_jax.simulation import IntegratorOptions
 RATES = {"stiffness": 60.0, "integral": 10.0, "observer": 200.0}  # of an object that is not large (`slowness`) [1/s]
 ENCODER_STEP = 2 * np.pi / 4096  # of angles as executions measure them unless told otherwise [rad]
 HASTE = 1.2  # largest speed that such a step causes, over the mean speed of the slowest phase
+SETTLED = 20.0  # least stiffness times the shortest phase's duration: in the bundled plans 15 and more
 RESERVE = 0.9  # fraction of the torque limits that the reference's torques and their corrections stay within
 PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
 BEYOND = 0.06  # how far the reference goes on beyond the path's end, to meet the contact that ends it [rad]
@@ -161,10 +162,13 @@ def feedback(
 def _default_rates(scene: Scene, tables: list[PathTable]) -> dict[str, float]:
     """Return the loop's rates: less for large objects, and for motions so slow that an encoder's steps reverse them.
 
-    Each step of the measured angle moves the object at about `w` times the step.
+    Each step of the measured angle moves the object at about `w` times the step. But the loop has to settle within the
+    shortest phase, also where another one is so short a way that it is slow.
     """
-    slowest = min(float(table.s[-1] / phase.duration) for table, phase in zip(tables, scene.phases, strict=True))
-    share = min(1 / slowness(scene), HASTE * slowest / (ENCODER_STEP * RATES["stiffness"]))
+    durations = [float(phase.duration) for phase in scene.phases]
+    slowest = min(float(table.s[-1]) / duration for table, duration in zip(tables, durations, strict=True))
+    stiffness = max(HASTE * slowest / ENCODER_STEP, SETTLED / min(durations))
+    share = min(1 / slowness(scene), stiffness / RATES["stiffness"])
     return {name: share * rate for name, rate in RATES.items()}
 
 
