@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from wholearm_jax.core import require_positive
-from wholearm_jax.feedback import Controller, begin, require_same_plan
+from wholearm_jax.feedback import ENCODER_COUNTS, Controller, begin, require_same_plan
 from wholearm_jax.feedback import step as law_step
 from wholearm_jax.model import Scene
 from wholearm_jax.phases import MOTOR_ERROR
@@ -27,7 +27,7 @@ class Hardware(NamedTuple):
 
     rate: float = 1000.0
     delay: float = 1e-3
-    counts: int = 4096
+    counts: int = ENCODER_COUNTS
     torque_noise: float = MOTOR_ERROR
 
 

@@ -39,8 +39,8 @@ from wholearm_jax.phases import (
 from wholearm_jax.simulation import IntegratorOptions
 
 RATES = {"stiffness": 60.0, "integral": 10.0, "observer": 200.0}  # of an object that is not large (`slowness`) [1/s]
-ENCODER_STEP = 2 * np.pi / 4096  # of angles as executions measure them unless told otherwise [rad]
-HASTE = 1.2  # largest speed that such a step causes, over the mean speed of the slowest phase
+ENCODER_COUNTS = 4096  # a turn, unless another encoder is given
+HASTE = 1.2  # largest speed that a step of such an encoder causes, over the mean speed of the slowest phase
 SETTLED = 20.0  # least stiffness times the shortest phase's duration: in the bundled plans 15 and more
 RESERVE = 0.9  # fraction of the torque limits that the reference's torques and their corrections stay within
 PUSH = 0.3  # largest torque of the feedback on the way, over the torque limit
@@ -167,7 +167,7 @@ def _default_rates(scene: Scene, tables: list[PathTable]) -> dict[str, float]:
     """
     durations = [float(phase.duration) for phase in scene.phases]
     slowest = min(float(table.s[-1]) / duration for table, duration in zip(tables, durations, strict=True))
-    stiffness = max(HASTE * slowest / ENCODER_STEP, SETTLED / min(durations))
+    stiffness = max(HASTE * slowest * ENCODER_COUNTS / (2 * np.pi), SETTLED / min(durations))
     share = min(1 / slowness(scene), stiffness / RATES["stiffness"])
     return {name: share * rate for name, rate in RATES.items()}
 

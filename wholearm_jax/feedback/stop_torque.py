@@ -130,14 +130,24 @@ def choose_push(
         margin at rest (the least of all objects). Where that is negative, pushes that squeeze the object more are
         tried as well; where none accelerates so much, it is that which accelerates most.
     """
-    push = _push_within(stops, torque, limit, TURNS if either_finger else np.zeros(1))
-    if either_finger and push.margin <= 0:  # one that squeezes the object more may hold it
-        push = max(push, _push_within(stops, torque, limit, STEEP_TURNS), key=lambda one: one.margin)
+    if not either_finger:
+        push = _push_within(stops, torque, limit, np.zeros(1), returning=False)
+    else:
+        push = _push_within(stops, torque, limit, TURNS, returning=True)
+        if push.margin <= 0:  # one that squeezes the object more may hold it
+            push = max(
+                push, _push_within(stops, torque, limit, STEEP_TURNS, returning=True), key=lambda one: one.margin
+            )
     return push.size, push.direction
 
 
-def _push_within(stops: list[StopStatics], torque, limit, turns: Float[np.ndarray, "turns"]) -> _Push:
-    """Choose the best push of those whose directions have these angles against that which accelerates most."""
+def _push_within(
+    stops: list[StopStatics], torque, limit, turns: Float[np.ndarray, "turns"], *, returning: bool
+) -> _Push:
+    """Choose the best push of those whose directions have these angles against that which accelerates most.
+
+    Those that bring back fingers are preferred where it has to be `returning`.
+    """
     pull = stops[0].acceleration[3:]
     ahead, across = pull / np.hypot(*pull), np.array([-pull[1], pull[0]]) / np.hypot(*pull)
     directions = (ahead + np.tan(turns)[:, None] * across) / np.hypot(*pull)
@@ -146,7 +156,7 @@ def _push_within(stops: list[StopStatics], torque, limit, turns: Float[np.ndarra
     moves = np.min([stop.acceleration[0] + torques @ stop.acceleration[3:] for stop in stops], axis=0)
     within = np.all(np.abs(torques) <= limit, axis=1)
     decisive = within & (moves >= stops[0].decisive)
-    if len(turns) > 1 and (returns := decisive & (stops[0].surplus(torques) > 0).all(1)).any():
+    if returning and (returns := decisive & (stops[0].surplus(torques) > 0).all(1)).any():
         decisive = returns
     candidates = np.flatnonzero(decisive)
     if len(candidates):

@@ -218,9 +218,11 @@ def _next_entries(search: _Search) -> Iterator[tuple[np.ndarray, tuple[Step, ...
 
 
 def _add_waiting_plans(search: _Search) -> None:
-    """Add plans that have been found but not judged, those of fewest phases first, until there are enough."""
+    """Add plans that have been found but not judged, those first that would have been, until there are enough."""
     waiting = {number: (z, steps) for queue in search.queues for _, number, z, steps, _ in queue}
-    for number, (z, steps) in sorted(waiting.items(), key=lambda entry: (_cost(search, entry[1][1]), entry[0])):
+    for number, (z, steps) in sorted(
+        waiting.items(), key=lambda entry: (_cost(search, entry[1][1]) + _delay(entry[1][1]), entry[0])
+    ):
         if len(search.plans) == search.count:
             return
         if number not in search.taken and steps and search.goal.is_reached(z):
@@ -261,7 +263,7 @@ def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tup
     if distance < search.nearest[0] - 1e-9:
         search.nearest = (distance, steps)
     entry, (short, long) = (next(search.order), z, steps, touching), search.queues
-    spent, to_go = _cost(search, steps), distance + sum(step.delay for step in steps)
+    spent, to_go = _cost(search, steps), distance + _delay(steps)
     if len(steps) < min(SHORT_PLAN, search.max_phases) or arrived:
         heapq.heappush(short, (spent + to_go, *entry))
     if search.max_phases > SHORT_PLAN and (len(steps) < search.max_phases or arrived):
@@ -271,6 +273,11 @@ def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tup
 def _cost(search: _Search, steps: tuple[Step, ...]) -> float:
     """Count phases, each regrasp with its price."""
     return len(steps) + (search.regrasp_cost or 0.0) * sum(step.regrasp is not None for step in steps)
+
+
+def _delay(steps: tuple[Step, ...]) -> float:
+    """Return by how many phases later the search goes on from the end of some steps."""
+    return sum(step.delay for step in steps)
 
 
 def _phases_to_go(search: _Search, z: np.ndarray) -> float:
