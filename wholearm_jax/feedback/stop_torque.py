@@ -130,14 +130,10 @@ def choose_push(
         margin at rest (the least of all objects). Where that is negative, pushes that squeeze the object more are
         tried as well; where none accelerates so much, it is that which accelerates most.
     """
-    if not either_finger:
-        push = _push_within(stops, torque, limit, np.zeros(1), returning=False)
-    else:
-        push = _push_within(stops, torque, limit, TURNS, returning=True)
-        if push.margin <= 0:  # one that squeezes the object more may hold it
-            push = max(
-                push, _push_within(stops, torque, limit, STEEP_TURNS, returning=True), key=lambda one: one.margin
-            )
+    push = _push_within(stops, torque, limit, TURNS if either_finger else np.zeros(1), returning=either_finger)
+    if either_finger and push.margin <= 0:  # one that squeezes the object more may hold it
+        steep = _push_within(stops, torque, limit, STEEP_TURNS, returning=True)
+        push = max(push, steep, key=lambda one: one.margin)
     return push.size, push.direction
 
 

@@ -220,9 +220,9 @@ def _next_entries(search: _Search) -> Iterator[tuple[np.ndarray, tuple[Step, ...
 def _add_waiting_plans(search: _Search) -> None:
     """Add plans that have been found but not judged, those first that would have been, until there are enough."""
     waiting = {number: (z, steps) for queue in search.queues for _, number, z, steps, _ in queue}
-    for number, (z, steps) in sorted(
-        waiting.items(), key=lambda entry: (_cost(search, entry[1][1]) + _delay(entry[1][1]), entry[0])
-    ):
+    order = {number: (_cost(search, steps) + _delay(steps), number) for number, (_, steps) in waiting.items()}
+    for number in sorted(waiting, key=order.__getitem__):
+        z, steps = waiting[number]
         if len(search.plans) == search.count:
             return
         if number not in search.taken and steps and search.goal.is_reached(z):
