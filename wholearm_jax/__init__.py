@@ -15,7 +15,10 @@ from wholearm_jax.ensembles import check
 from wholearm_jax.feedback import Controller, feedback
 from wholearm_jax.files import (
     load,
+    load_goal,
+    load_start,
     parse,
+    parse_start,
     read_controller,
     read_outline,
     read_torque,
@@ -50,9 +53,12 @@ __all__ = [
     "feedback",
     "keep_compiled",
     "load",
+    "load_goal",
+    "load_start",
     "margin",
     "optimise",
     "parse",
+    "parse_start",
     "plan",
     "plan_with_hand",
     "quasistatic",

@@ -70,6 +70,11 @@ def test_other_commands_still_need_phases(wholearm, tmp_path):
     del data["phase"]
     path = tmp_path / "scene.toml"
     path.write_text(tomli_w.dumps(data))
+    advice = "; `wholearm plan` finds them, and in Python `wa.plan(wa.load_start(...), ...)`"
+    code, _, err = wholearm("optimise", path)
+    assert (code, err) == (2, f"wholearm: {path}: phase: missing{advice}\n")
+    path.write_text(tomli_w.dumps(data | {"phase": []}))
     code, _, err = wholearm("optimise", path)
     assert code == 2
-    assert err == f"wholearm: {path}: phase: missing\n"
+    assert err.startswith(f"wholearm: {path}: phase: ")
+    assert err.endswith(f"{advice}\n")

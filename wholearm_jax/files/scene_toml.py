@@ -10,9 +10,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 import tomli_w
-from pydantic import (
-    ValidationError,
-)
+from pydantic import ValidationError
 
 from wholearm_jax.core import DoubtfulInput, SceneError, as_device_array, write_atomically
 from wholearm_jax.files.angles import doubtful_angles
@@ -35,6 +33,9 @@ from wholearm_jax.model import (
 
 ARRIVALS = {"rest": Arrival.AT_REST, "moving": Arrival.MOVING, "caught": Arrival.ANY_SPEED}
 """Words for `arrive`."""
+
+FIND_PHASES = "; `wholearm plan` finds them, and in Python `wa.plan(wa.load_start(...), ...)`"
+"""What a scene without phases is good for."""
 
 
 def bundled() -> tuple[str, ...]:
@@ -59,12 +60,23 @@ def load(name: str | Path) -> Scene:
 
 
 def load_start(name: str | Path) -> Scene:
-    """Read a scene as `load` does; its phases may be missing."""
+    """Read a scene as `load` does; its phases may be missing, as `plan` finds them.
+
+    >>> (len(wa.load_start("heptagon").phases), wa.load_goal("heptagon"))
+    (2, None)
+    """
     return parse_start(_read_toml(name), str(name))
 
 
 def parse_start(data: dict[str, Any], source: str = "scene") -> Scene:
-    """Build a scene as `parse` does; its phases may be missing."""
+    """Build a scene as `parse` does; its phases may be missing, as `plan` finds them.
+
+    >>> from wholearm_jax.files.scene_toml import to_dict
+    >>> data = to_dict(wa.load("heptagon"))
+    >>> del data["phase"]
+    >>> wa.parse_start(data).phases
+    ()
+    """
     if data.get("phase"):
         return parse(data, source)
     contacts = ["palm:v0", "palm:v1", "palm:v2", "finger1:v0"]  # which every polygon has
@@ -77,6 +89,10 @@ def load_goal(name: str | Path) -> dict[str, Any] | None:
 
     Raises:
         SceneError: if it is not a valid goal.
+
+    >>> _ = (folder / "part.toml").write_text('[goal]\\nby = { phi = "-40 deg" }')  # some folder
+    >>> wa.load_goal(folder / "part.toml")
+    {'goal': {}, 'by': {'phi': -0.6981317007977318}, 'tolerance': {}}
     """
     data = _read_toml(name)
     if "goal" not in data:
@@ -147,7 +163,9 @@ def parse(data: dict[str, Any], source: str = "scene") -> Scene:
     try:
         checked = SceneTables.model_validate(data)
     except ValidationError as error:
-        raise SceneError(f"{source}: {explain_validation_error(error)}") from None
+        complaint = explain_validation_error(error)
+        advice = FIND_PHASES if complaint.startswith("phase: ") and not data.get("phase") else ""
+        raise SceneError(f"{source}: {complaint}{advice}") from None
     for doubt in (*doubtful_angles(data), *doubtful_units(checked)):
         warnings.warn(f"{source}: {doubt}", DoubtfulInput, stacklevel=2)
     scene = _build(checked)
