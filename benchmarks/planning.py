@@ -115,7 +115,8 @@ def random_tree(scene: wa.Scene, by: dict, seconds: float, seed: int, max_phases
         z, steps, names = nodes[int(np.argmin(apart))] if rng.random() < 0.5 else nodes[rng.integers(len(nodes))]
         if len(steps) == max_phases:
             continue
-        moves = [move for move in moves_from(scene, as_device_array(z), names) if move.margins[0] > 0]
+        left = steps[-1].leaves if steps else None
+        moves = [move for move in moves_from(scene, as_device_array(z), names, left=left) if move.margins[0] > 0]
         if not moves:
             continue
         move = moves[rng.integers(len(moves))]
@@ -128,9 +129,8 @@ def random_tree(scene: wa.Scene, by: dict, seconds: float, seed: int, max_phases
                 if found is not None and found.bound > 0 and (best is None or found.bound > best.bound):
                     best = found
         if held == len(move.places) - 1:
-            nodes.append(
-                (move.places[-1], (*steps, Step(move.contacts, move.toward, None, move.places[-1], 0.0)), None)
-            )
+            step = Step(move.contacts, move.toward, None, move.places[-1], 0.0, leaves=move.leaves)
+            nodes.append((move.places[-1], (*steps, step), None))
     return best
 
 

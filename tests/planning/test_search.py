@@ -73,6 +73,33 @@ def test_a_plan_ends_where_its_path_meets_the_goal_and_not_at_a_tip(tmp_path, sh
     assert "leaves its feature" not in best.reasons[-1]
 
 
+def test_no_plan_goes_on_with_a_contact_at_the_very_end_of_its_feature():
+    """A vertex slides to finger 2's tip; there the object was to be tipped about it."""
+    finger = {"length": 0.1457, "inertia": 1.26e-3, "viscous": 0.005, "dry": 0.01, "torque_limit": 5.0}
+    joints = 0.1153, -0.1153
+    hand = {f"finger{k + 1}": finger | {"joint": [x, 0.0]} for k, x in enumerate(joints)}
+    outline = [[-44.6, -0.7], [11.0, -32.4], [34.3, -14.2], [64.3, 23.3], [16.8, 28.0], [3.7, 24.8]]
+    shape = {"vertices": [[x / 1e3, y / 1e3] for x, y in outline], "mass": 1.0, "friction": 0.1}
+    start = {"on": "e1", "x": 0.0}
+    hand["fingers"] = "layered"
+    part = wa.parse_start({"title": "", "gravity": 9.81, "hand": hand, "object": shape, "start": start})
+    corners = np.array(shape["vertices"]) - Polygon(shape["vertices"]).centroid.coords[0]
+    found = wa.plan(part, by={"phi": 0.3}, count=1, max_nodes=100)
+    (best,) = found.plans
+    clearances = []
+    for before, after, z in zip(best.steps[:-1], best.steps[1:], best.ends[:-1], strict=True):
+        kept = {name.split()[0] for name in before.contacts} & {name.split()[0] for name in after.contacts}
+        for name in kept:
+            link, feature = name.split(":")
+            if link != "palm" and feature[0] == "v":
+                x, y = corners[int(feature[1:])]
+                across = z[0] + x * np.cos(z[2]) - y * np.sin(z[2]) - joints[int(link[-1]) - 1]
+                above = z[1] + x * np.sin(z[2]) + y * np.cos(z[2])
+                clearances.append(0.1457 - np.hypot(across, above))
+    assert len(clearances) >= 3
+    assert min(clearances) > 1e-3
+
+
 @pytest.mark.slow
 def test_the_best_plan_can_be_optimised_as_it_is(turned):
     optimum = wa.optimise(turned.plans[0].scene, knots=21)

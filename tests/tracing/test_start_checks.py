@@ -13,7 +13,7 @@ from wholearm_jax.tracing import hold_same_tip
 ANGLE = {"finger1": 2.0, "finger2": 1.1}
 
 
-def scene_of(vertices, length=0.11):
+def scene_of(vertices, length=0.11, then=("palm:v0", "finger1:v2", "finger1:e1", "finger2:e3")):
     finger = {"length": length, "inertia": 2e-3, "viscous": 0.02, "dry": 0.01, "torque_limit": 1.0}
     return parse(
         {
@@ -31,7 +31,7 @@ def scene_of(vertices, length=0.11):
                 },
                 {
                     "name": "two",
-                    "contacts": ["palm:v0", "finger1:v2", "finger1:e1", "finger2:e3"],
+                    "contacts": list(then),
                     "toward": "theta2-",
                     "duration": 1.0,
                 },
@@ -88,6 +88,14 @@ def test_a_plan_that_goes_on_with_a_tip_at_a_corner_is_refused_by_name():
     second = result.phases[1]
     assert second.status is wa.Status.LEFT_FORMATION
     assert "finger1:v2 and finger1:e1 hold a tip at a vertex" in result.message or "finger1:v2 and" in second.detail
+
+
+@pytest.mark.parametrize("contact", ["finger1:v2", "finger1:e1"])
+def test_a_plan_that_turns_an_object_on_the_very_tip_of_a_finger_is_refused_by_name(contact):
+    scene = scene_of(BOX, then=("palm:v0", f"{contact} rolling", "finger2:e3"))
+    second = wa.simulate(scene, wa.quasistatic(scene)).phases[1]
+    assert second.status is wa.Status.LEFT_FORMATION
+    assert f"{contact} rolling at the end of its feature, where it slips off" in second.detail
 
 
 @pytest.fixture(scope="module")

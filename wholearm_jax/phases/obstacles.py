@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wholearm_jax.model import (
+    CORNER_TOL,
     FEATURE_GROUPS,
     LINK_OBSTACLES,
     LINKS,
@@ -23,7 +24,7 @@ from wholearm_jax.model import (
     rigid_body,
     scaled_mechanics,
 )
-from wholearm_jax.tracing import hold_same_tip, lie_before_link, run_into_object
+from wholearm_jax.tracing import hold_same_tip, lie_before_link, pivot_clearance, run_into_object
 
 STRETCH_PLACES = 17  # of a link's stretch in the object, at which its depth is looked at
 LEVEL_ANGLE = 1e-9  # [rad], within which a finger is level with the palm
@@ -87,10 +88,12 @@ def describe_overlaps(scene: Scene, z: Float[Array | np.ndarray, "5"], tolerance
 def describe_refused_start(scene: Scene, phase: Phase, z: Float[Array, "5"]) -> str | None:
     """Say why no path of a phase can begin at `z` (SI); None where nothing overlaps and contacts are on their features.
 
-    A fingertip at a vertex is named where two contacts hold it, or the finger would cut the vertex off, and a vertex
-    where the object lies behind the link that it touches.
+    A fingertip at a vertex is named where two contacts hold it, where the finger would cut the vertex off, and where a
+    contact rolls there; a vertex where the object lies behind the link that it touches.
     """
-    along, lower, upper, twice, inward = (np.asarray(a) for a in _formation_places(scene, phase.formation, z))
+    along, lower, upper, twice, inward, clearance = (
+        np.asarray(a) for a in _formation_places(scene, phase.formation, z)
+    )
     beyond = np.maximum(lower - along, along - upper)
     names = [phase.formation.names[k] for k in phase.formation.contact_of_row]
     misplaced = dict.fromkeys(
@@ -101,6 +104,10 @@ def describe_refused_start(scene: Scene, phase: Phase, z: Float[Array, "5"]) -> 
         for i, j in np.argwhere(np.triu(twice))
     ]
     corners += [f"{names[k]}: the finger comes from the object's side of that edge" for k in np.flatnonzero(inward)]
+    corners += [
+        f"{names[k]} at the end of its feature, where it slips off: let the phase before it end sooner"
+        for k in np.flatnonzero(clearance < CORNER_TOL * object_radius(scene.object))
+    ]
     corners += _touched_from_behind(scene, phase.formation, z)
     return "; ".join((*describe_overlaps(scene, z), *misplaced, *corners)) or None
 
@@ -130,7 +137,8 @@ def _formation_places(scene: Scene, formation: ContactFormation, z):
     contacts = contact_set(body, scene.hand, formation)
     at = contact_kinematics(contacts, z)
     twice = hold_same_tip(contacts, at, contacts, at)
-    return at.along, contacts.lower, contacts.upper, twice, run_into_object(contacts, at, z, body.flush_tolerance)
+    inward = run_into_object(contacts, at, z, body.flush_tolerance)
+    return at.along, contacts.lower, contacts.upper, twice, inward, pivot_clearance(contacts, at)
 
 
 def _object_overlaps(scene: Scene, z, tolerance: float) -> list[str]:

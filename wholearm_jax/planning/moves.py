@@ -20,16 +20,20 @@ from wholearm_jax.model import (
     Scene,
     alike_formations,
     contact_formation,
+    contact_kinematics,
+    feature_pair,
     path_target,
     rigid_body,
+    scaled_mechanics,
 )
 from wholearm_jax.phases import configuration, trace_phase
 from wholearm_jax.planning.path_choices import path_choices
 from wholearm_jax.planning.successors import touching_contacts
-from wholearm_jax.tracing import Resolution
+from wholearm_jax.tracing import PathEnd, Resolution, pivot_clearance
 
 MOVES_PER_CALL = 8  # paths that one call of the program traces; the last call is filled up
 SHORTEST_MOVE = 0.02  # path length, in the object's radii, below which a hand cannot tell a move from standing still
+LEAST_HOLD = 0.02  # distance of a contact from its feature's end, likewise, below which a hand may miss it
 PLACES = 33  # configurations of a path that are kept
 RESOLUTION = Resolution(panels=16)  # of the planner's tables: forces to three digits
 
@@ -44,6 +48,8 @@ class Move(NamedTuple):
     margins: np.ndarray  # (PLACES,): largest compressive margin [N] at rest at these places, moving on forward
     end_reason: int  # a `PathEnd`
     end_contact: int
+    leaves: str | None  # the contact that is at its feature's end where the path ends, as at a fingertip
+    secure: int  # number of the last place at which it is still far enough from there
 
 
 class _Paths(NamedTuple):
@@ -51,10 +57,12 @@ class _Paths(NamedTuple):
 
     status: Int[Array, "moves"]
     length: Float[Array, "moves"]
+    pivot: Float[Array, "moves"]  # distance of the nearest rolling contact from the end of its feature
     places: Float[Array, "moves places 5"]
     margins: Float[Array, "moves places"]
     end_reason: Int[Array, "moves"]
     end_contact: Int[Array, "moves"]
+    secure: Int[Array, "moves"]
 
 
 def moves_from(
@@ -62,20 +70,27 @@ def moves_from(
     z: Float[Array, "5"],
     touching: Sequence[str] | None = None,
     *,
+    left: str | None = None,
     rolling: bool = True,
     regrasps: bool = False,
 ) -> tuple[Move, ...]:
     """Return all moves from a configuration: formations `2R + S = 4` of what touches, sliding and rolling, both ways.
 
+    A contact that has come to the end of its feature, as a vertex to a fingertip, holds no longer: a micrometre farther
+    it is gone. Moves that keep it are left out, as are those on which a contact rolls so near the end of its feature
+    that a hand may miss it.
+
     Args:
         scene: the hand and the object.
         z: the configuration (5,), SI.
         touching: the contacts to combine; those that touch at `z` unless given.
+        left: the contact, if any, at whose feature's end the path to `z` has ended.
         rolling: whether contacts may roll.
         regrasps: whether a finger may be away.
     """
     names = touching_contacts(scene, z) if touching is None else touching
-    chosen = [*path_choices(scene, z, names, rolling=rolling, away=AWAY_NAMES if regrasps else ())]
+    choices = path_choices(scene, z, names, rolling=rolling, away=AWAY_NAMES if regrasps else ())
+    chosen = [choice for choice in choices if left not in {*map(feature_pair, choice[0])}]
     parts = [chosen[first : first + MOVES_PER_CALL] for first in range(0, len(chosen), MOVES_PER_CALL)]
     if not parts:
         return ()
@@ -85,9 +100,11 @@ def moves_from(
     for part, paths in zip(parts, traced, strict=True):
         for k, (contacts, toward) in enumerate(part):
             row = jax.tree.map(lambda a, k=k: a[k], paths)
-            if row.status == Status.OK and row.length >= SHORTEST_MOVE:
-                ends = int(row.end_reason), int(row.end_contact)
-                moves.append(Move(contacts, toward, float(row.length), row.places, row.margins, *ends))
+            if row.status == Status.OK and row.length >= SHORTEST_MOVE and row.pivot >= LEAST_HOLD:
+                reason, contact = int(row.end_reason), int(row.end_contact)
+                leaves = _contact_of_row(contacts, contact) if reason == PathEnd.FEATURE_END else None
+                path = float(row.length), row.places, row.margins
+                moves.append(Move(contacts, toward, *path, reason, contact, leaves, int(row.secure)))
     return tuple(moves)
 
 
@@ -101,6 +118,12 @@ def _threads() -> ThreadPoolExecutor:
 @functools.lru_cache(maxsize=4096)
 def _formation(contacts: tuple[str, ...]) -> ContactFormation:
     return jax.tree.map(np.asarray, contact_formation(contacts))
+
+
+def _contact_of_row(contacts: tuple[str, ...], row: int) -> str:
+    """Name the contact, as if it slid, of a row of a formation's constraints."""
+    formation = _formation(contacts)
+    return feature_pair(formation.names[formation.contact_of_row[row]])
 
 
 @functools.cache
@@ -133,7 +156,15 @@ def _trace_moves(body, hand, gravity, formations, targets, z) -> _Paths:
 
         places = jax.vmap(configuration, (None, 0, 0))(dynamics, segment, s)
         margins = jax.vmap(lambda s: best_quasistatic_torque(dynamics, s).margin)(s)
+        mechanics = scaled_mechanics(body, hand, gravity, formation)
+        at = jax.vmap(contact_kinematics, (None, 0))(mechanics.contacts, places / mechanics.configuration_unit)
+        pivot = pivot_clearance(mechanics.contacts, jax.tree.map(lambda a: a[0], at)).min()
+
+        # Where does the contact that leaves its feature, if one does, come near the end?
         reason, contact = traced.path.end_reason, traced.path.end_contact
-        return _Paths(dynamics.status, dynamics.length, places, margins, reason, contact)
+        left = jnp.minimum(contact, at.along.shape[1] - 1)
+        inside = jnp.minimum(at.along - mechanics.contacts.lower, mechanics.contacts.upper - at.along)[:, left]
+        secure = jnp.where(inside >= LEAST_HOLD, jnp.arange(PLACES), 0).max()
+        return _Paths(dynamics.status, dynamics.length, pivot, places, margins, reason, contact, secure)
 
     return jax.lax.map(one, (formations, targets))

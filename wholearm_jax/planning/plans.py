@@ -25,6 +25,7 @@ class Step:
     end: np.ndarray  # (5,) `z` (SI)
     margin: float  # [N], least on the way, at rest
     regrasp: str | None = None  # what a finger does that moves alone, as scene files write it
+    leaves: str | None = None  # the contact that is at its feature's end there: no next phase keeps it
     delay: float = 0.0  # by how many phases later the search goes on from there
 
 

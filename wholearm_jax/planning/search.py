@@ -45,7 +45,6 @@ from wholearm_jax.planning.plans import (
 )
 from wholearm_jax.planning.regrasps import regrasp_stops, separate_regrasps
 from wholearm_jax.planning.successors import touching_contacts
-from wholearm_jax.tracing import PathEnd
 
 STOPS = {  # fractions of a path at which other moves may begin, and by how many phases later they are tried
     **dict.fromkeys((1 / 3, 2 / 3), 0.0),
@@ -77,7 +76,7 @@ class _Search:
     regrasp_cost: float | None
     queues: tuple[list[Any], list[Any]] = field(default_factory=lambda: ([], []))  # for short plans, for longer ones
     taken: set[int] = field(default_factory=set)  # numbers of the entries that have left one of them
-    visited: set[tuple[int, ...]] = field(default_factory=set)
+    visited: set[tuple[Any, ...]] = field(default_factory=set)
     order: Any = field(default_factory=itertools.count)
     nearest: tuple[float, tuple[Step, ...]] = (np.inf, ())
     plans: list[Plan] = field(default_factory=list)
@@ -254,7 +253,7 @@ def _add_plan(search: _Search, steps: tuple[Step, ...]) -> None:
 def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tuple[str, ...] | None) -> None:
     """Add a configuration to the queues unless it is there already, or no plan may go on from it."""
     unit = np.array([search.radius, search.radius, 1, 1, 1])
-    key = tuple(np.round(z / unit / MERGE_TOL).astype(int).tolist())
+    key = (steps[-1].leaves if steps else None, *np.round(z / unit / MERGE_TOL).astype(int).tolist())
     arrived = search.goal.is_reached(z)
     if key in search.visited and not arrived:  # other ways to the goal are other plans
         return
@@ -291,7 +290,8 @@ def _phases_to_go(search: _Search, z: np.ndarray) -> float:
 def _expand(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching) -> None:
     """Trace all moves from a configuration and push the places at which they may be left."""
     regrasps = search.regrasp_cost is not None
-    moves = moves_from(search.scene, as_device_array(z), touching, rolling=search.rolling, regrasps=regrasps)
+    left, here = steps[-1].leaves if steps else None, as_device_array(z)
+    moves = moves_from(search.scene, here, touching, left=left, rolling=search.rolling, regrasps=regrasps)
     search.nodes += 1
     search.moves += len(moves)
     previous = steps[-1].contacts if steps else None
@@ -340,12 +340,15 @@ def _stops(search: _Search, move: Move) -> Iterator[tuple[Step, bool]]:
     for name, value in search.goal.values.items():
         yield from _crossings(move, lowest, name, value)
     end = move.places[last]
-    leaves = move.end_reason == PathEnd.FEATURE_END and search.goal.is_reached(end)
-    yield Step(move.contacts, move.toward, None, end, float(lowest[last]), delay=AT_TIP if leaves else 0.0), True
+    delay = AT_TIP if move.leaves and search.goal.is_reached(end) else 0.0
+    yield Step(move.contacts, move.toward, None, end, float(lowest[last]), leaves=move.leaves, delay=delay), True
     displacement = np.abs(move.places[last] - move.places[0]) / np.array([search.radius, search.radius, 1, 1, 1])
     name = COORDINATES[int(np.argmax(displacement))]
-    for fraction, delay in STOPS.items():
-        value = float(move.places[round(fraction * last)][COORDINATES.index(name)])
+    stops = {round(fraction * last): delay for fraction, delay in STOPS.items()}
+    if move.leaves:  # a hand that is to go on with the contact stops before its feature's end
+        stops[move.secure] = 0.0
+    for place, delay in stops.items():
+        value = float(move.places[place][COORDINATES.index(name)])
         for step, is_end in itertools.islice(_crossings(move, lowest, name, value), 1):
             yield replace(step, delay=delay), is_end
 

@@ -46,6 +46,19 @@ def _hold_gap(contacts: ContactSet) -> Bool[Array, "rows"]:
     return ~contacts.tangential if contacts.is_away is None else ~contacts.tangential & ~contacts.is_away
 
 
+def pivot_clearance(contacts: ContactSet, at: ContactKinematics) -> Float[Array, "rows"]:
+    """How far contacts that roll are from the ends of their features; infinite for those that do not.
+
+    A vertex that turns on the very tip of a finger, or a tip that turns on the end of an edge, slips off either side.
+
+    Args:
+        contacts: of a formation.
+        at: their kinematics.
+    """
+    inside = jnp.minimum(at.along - contacts.lower, contacts.upper - at.along)
+    return jnp.where(contacts.tangential, inside, jnp.inf)
+
+
 def run_into_object(
     contacts: ContactSet, at: ContactKinematics, z: Float[Array, "5"], tolerance: Float[Array, ""]
 ) -> Bool[Array, "rows"]:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from wholearm_jax.core import eps_power, null_vector
 from wholearm_jax.model import (
+    CORNER_TOL,
     EDGE,
     FEATURE_GROUPS,
     FINGER_ROOT,
@@ -21,7 +22,7 @@ from wholearm_jax.model import (
     link_overlaps,
     next_vertex,
 )
-from wholearm_jax.tracing.corners import hold_same_tip, run_into_object
+from wholearm_jax.tracing.corners import hold_same_tip, pivot_clearance, run_into_object
 
 
 def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) -> Bool[Array, ""]:
@@ -29,7 +30,8 @@ def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) ->
 
     That is so where a contact lies beyond its feature, a vertex behind the palm, part of a link within the object, the
     object behind a link that one of its vertices touches, or a vertex of a convex object behind a finger on which
-    another one slides, or where two contacts hold a fingertip at a vertex, or the finger would cut that vertex off.
+    another one slides, where two contacts hold a fingertip at a vertex, or the finger would cut that vertex off, or
+    where a contact rolls at the end of its feature.
     Behind a finger whose tip touches an edge, vertices may lie.
     """
     tolerance = eps_power(z, 5 / 8)
@@ -53,6 +55,7 @@ def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) ->
         | jnp.any(behind)
         | jnp.any(from_behind)
         | jnp.any(hold_same_tip(mechanics.contacts, contacts, mechanics.contacts, contacts))
+        | jnp.any(pivot_clearance(mechanics.contacts, contacts) < CORNER_TOL)
         | jnp.any(run_into_object(mechanics.contacts, contacts, z, flush_tolerance))
         | link_penetrates_object(mechanics, pairs, flush_tolerance)
     )
