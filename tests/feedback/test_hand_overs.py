@@ -1,5 +1,6 @@
 """Laws where a vertex and a fingertip take over from one another: nothing stops the object there."""
 
+import equinox as eqx
 import mujoco
 import numpy as np
 import pytest
@@ -99,3 +100,59 @@ def test_a_vertex_meets_a_fingers_face_as_far_as_its_tip(box, beyond, touches):
     for contact in found:
         np.testing.assert_allclose(bodies.toward[row] * contact.frame[:2], normal, atol=1e-6)
         assert contact.dist == pytest.approx(-5e-6, rel=1e-2)
+
+
+@pytest.fixture(scope="module")
+def short_way():
+    """A pentagon that a fingertip pushes by 3.5 mm to a vertex, and the finger, which takes over there, by 9 mm."""
+    finger = {"length": 0.1383, "inertia": 1.08e-3, "viscous": 0.005, "dry": 0.01, "torque_limit": 5.0}
+    finger["range"] = [0.3, 2.8]
+    outline = [[-21.9, 47.2], [-41.0, -11.6], [-15.7, -38.0], [38.5, -41.3], [62.6, -13.2]]
+    phases = [
+        {"name": name, "contacts": ["palm:v0", "palm:v1", "finger1:v3", second], "toward": "x-", "duration": 1.0}
+        for name, second in (("to the vertex", "finger2:e4"), ("beyond it", "finger2:v4"))
+    ]
+    phases[1]["until"] = {"x": -0.0125}
+    scene = wa.parse(
+        {
+            "title": "a short way to a hand-over",
+            "gravity": [-3.0, -9.0],
+            "hand": {
+                "fingers": "layered",
+                "finger1": finger | {"joint": [0.1108, 0.0]},
+                "finger2": finger | {"joint": [-0.1108, 0.0]},
+            },
+            "object": {
+                "vertices": [[x / 1e3, y / 1e3] for x, y in outline],
+                "mass": 0.2,
+                "friction": {"palm": 0.3, "finger1": 0.05, "finger2": 0.1},
+            },
+            "start": {"x": 0.0, "y": 0.0418, "phi": 1.8845, "theta1": 2.3713, "theta2": 0.7706},
+            "phase": phases,
+        }
+    )
+    return wa.optimise(scene)
+
+
+def of_other_friction(scene):
+    return [eqx.tree_at(lambda s: s.object.friction, scene, k * scene.object.friction) for k in (0.9, 0.95, 1.05, 1.1)]
+
+
+def test_a_law_that_lets_objects_stop_short_is_none(short_way):
+    """Each contact is kept, but the object does not come to the hand-over, or runs beyond it."""
+    slow = feedback(short_way.scene, short_way.torque, friction=0.1, stiffness=26.0, integral=4.3, observer=87.0)
+    checked = wa.check(of_other_friction(short_way.scene), controller=slow)
+    assert (checked.margin > 0).all()
+    assert not (checked.status == wa.Status.OK).all()
+    assert slow.margin == -np.inf
+
+
+def test_a_motion_that_is_slow_at_a_hand_over_has_the_rates_of_a_faster_one(short_way):
+    law = feedback(short_way.scene, short_way.torque, friction=0.1)
+    assert law.margin > 0
+    assert law.stiffness > 40
+    checked = wa.check(of_other_friction(short_way.scene), controller=law)
+    assert (checked.status == wa.Status.OK).all()
+    done = execute(short_way.result, timestep=2e-4, controller=law)
+    assert done.ending.value == "ok"
+    assert done.position_error < 5e-4

@@ -1,5 +1,6 @@
 """`wholearm optimise`: the torques with the largest margin, for one scene or (`--robust`) for an ensemble."""
 
+import math
 import sys
 import time
 from pathlib import Path
@@ -122,10 +123,11 @@ def _design(optimum, uncertain: dict[str, float], as_json: bool):
     if weakest.margin > 0:
         _note_impulse(optimum.scene, least_passing_impulse(optimum.scene, objects["friction"], objects["mass"]))
         return controller
-    note(
-        f"no controller.json: in '{weakest.name}' a contact of some object of the set would open, least force "
-        f"{weakest.margin:.3g} N; {_what_holds(held_set(optimum.scene, optimum.torque, **objects), uncertain)}"
-    )
+    why = f"a contact of some object of the set would open, least force {weakest.margin:.3g} N"
+    if weakest.margin == -math.inf:
+        why = "some object of the set would not follow, or not end where it should"
+    smaller = _what_holds(held_set(optimum.scene, optimum.torque, **objects), uncertain)
+    note(f"no controller.json: in '{weakest.name}' {why}; {smaller}")
     return None
 
 

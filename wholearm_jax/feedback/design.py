@@ -26,6 +26,7 @@ from wholearm_jax.model import Arrival, Scene, TorqueSchedule
 from wholearm_jax.phases import (
     CLOSED_LOOP_TOLERANCE,
     Result,
+    SimulatedPhase,
     TracedPhase,
     ends_at_stop,
     group_phases,
@@ -59,6 +60,7 @@ class Part(NamedTuple):
     scene: Scene
     paths: tuple[TracedPhase, ...]
     is_held: bool
+    has_own_shape: bool
 
 
 class Approach(NamedTuple):
@@ -110,8 +112,8 @@ def feedback(
         ValueError: For numbers that are out of range, for a plan whose paths cannot be traced, where both joints stand
             still on a path, and where a schedule fails whose motion is asked for.
     """
-    rates = {"stiffness": stiffness, "integral": integral, "observer": observer}
-    given = {name: rate for name, rate in rates.items() if rate is not None}
+    wanted = {"stiffness": stiffness, "integral": integral, "observer": observer}
+    given = {name: rate for name, rate in wanted.items() if rate is not None}
     require_positive(**given)
     if not (0 <= friction < 1 and 0 <= mass < 1):
         raise ValueError("friction, mass: shares of at least 0 and less than 1")
@@ -135,8 +137,8 @@ def feedback(
     ]
     either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
     limit, units = RESERVE * np.asarray(scene.hand.torque_limit), cost_units(scene)
-    parts = [Part(*each, is_held=True) for each in zip(scenes, traces, strict=True)]
-    parts += [Part(*each, is_held=bool(held)) for each in zip(shapes, drawn, strict=True)]
+    parts = [Part(*each, is_held=True, has_own_shape=False) for each in zip(scenes, traces, strict=True)]
+    parts += [Part(*each, is_held=bool(held), has_own_shape=True) for each in zip(shapes, drawn, strict=True)]
     laws = []
     for group in group_phases(scene):
         options = _motions(scene, group, tables, approaches, trajectory(result), own_motion)
@@ -146,30 +148,36 @@ def feedback(
         best = max(range(len(choices)), key=lambda option: _worst_first(choices[option]))
         for k, motion, choice in zip(group, options[best], choices[best], strict=True):
             laws.append(_phase_law(scene, k, tables[k], terms[k][0], motion, choice, approaches[k], parts))
-    slow = slowness(scene)
-    controller = Controller(
-        title=scene.title,
-        phases=tuple(laws),
-        **_default_rates(scene, tables) | given,
-        push=_push(scene),
-        felt=(FELT[0] / slow, FELT[1] * slow),
-        patience=LONGEST_DELAY * slow,
-        torque_limit=np.asarray(scene.hand.torque_limit),
-    )
-    return _with_simulated_margins(controller, parts)
+    slow, found = slowness(scene), []
+    for rates in _default_rates(scene, tables)[: 1 if len(given) == len(RATES) else None]:
+        controller = Controller(
+            title=scene.title,
+            phases=tuple(laws),
+            **rates | given,
+            push=_push(scene),
+            felt=(FELT[0] / slow, FELT[1] * slow),
+            patience=LONGEST_DELAY * slow,
+            torque_limit=np.asarray(scene.hand.torque_limit),
+        )
+        found.append(_with_simulated_margins(controller, parts))
+        if found[-1].margin > 0:
+            break
+    return max(found, key=lambda controller: controller.margin)
 
 
-def _default_rates(scene: Scene, tables: list[PathTable]) -> dict[str, float]:
-    """Return the loop's rates: less for large objects, and for motions so slow that an encoder's steps reverse them.
+def _default_rates(scene: Scene, tables: list[PathTable]) -> list[dict[str, float]]:
+    """Return rates of the loop to try: less for large objects, and for motions so slow that an encoder's steps reverse.
 
-    Each step of the measured angle moves the object at about `w` times the step. But the loop has to settle within the
-    shortest phase, also where another one is so short a way that it is slow.
+    Each step of the measured angle moves the object at about `w` times the step, which is too much for slow motions.
+    But the loop has to settle within the shortest phase, also where another one is so short a way that it is slow; and
+    where no law holds at the lower rates, one may at those of faster motions.
     """
     durations = [float(phase.duration) for phase in scene.phases]
     slowest = min(float(table.s[-1]) / duration for table, duration in zip(tables, durations, strict=True))
     stiffness = max(HASTE * slowest * ENCODER_COUNTS / (2 * np.pi), SETTLED / min(durations))
-    share = min(1 / slowness(scene), stiffness / RATES["stiffness"])
-    return {name: share * rate for name, rate in RATES.items()}
+    usual = 1 / slowness(scene)
+    shares = sorted({min(usual, stiffness / RATES["stiffness"]), usual})
+    return [{name: share * rate for name, rate in RATES.items()} for share in shares]
 
 
 def _worst_first(choices: list[TorqueChoice]) -> list[float]:
@@ -191,15 +199,21 @@ def _with_simulated_margins(controller: Controller, parts: list[Part]) -> Contro
     """Lower the margins of a controller to those of the parts to be held, simulated under it.
 
     The choice of torques lets every object move as the reference does; in closed loop one of other friction is late,
-    or early, until the loop has made up for it.
+    or early, until the loop has made up for it. Of the planned shape, every object has to end each phase as planned.
     """
     tables, options = law_tables(controller), IntegratorOptions(tolerance=CLOSED_LOOP_TOLERANCE)
     held = [part for part in parts if part.is_held and has_paths(part.paths)]
     runs = [simulate_closed_loop(part.scene, tables, part.paths, options) for part in held]
-    margins = np.array([[float(phase.margin_result.margin) for phase in run] for run in runs])
+    margins = np.array([[_least_force(phase, part) for phase in run] for part, run in zip(held, runs, strict=True)])
     least = np.where(np.isnan(margins).any(0), -np.inf, margins.min(0)).tolist()
     phases = zip(controller.phases, least, strict=True)
     return replace(controller, phases=tuple(replace(law, margin=min(law.margin, margin)) for law, margin in phases))
+
+
+def _least_force(phase: SimulatedPhase, part: Part) -> float:
+    """Return the least force of a simulated phase [N]; minus infinity where it does not end as it should."""
+    ends = part.has_own_shape or int(phase.assessment.status) in (Status.OK, Status.CONTACT_LOST)
+    return float(phase.margin_result.margin) if ends else -np.inf
 
 
 def _terms_of_set(table: PathTable, alike: list[TracedPhase], other_shapes: list[TracedPhase]) -> list[PathTerms]:
