@@ -57,7 +57,7 @@ TYPICAL_SHIFT, TYPICAL_TURN = 0.5, 0.5  # of one move [object radii, rad], for t
 SHORT_PLAN = 5  # phases
 ESTIMATE_WEIGHT = 3.0  # in the order for longer plans
 SEARCH_PATIENCE = 1.0  # nodes without a better plan, over those up to the last one,
-LEAST_PATIENCE = 20  # and at least so many
+LEAST_PATIENCE = 40  # and at least so many
 
 
 @dataclass
