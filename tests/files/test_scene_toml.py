@@ -296,7 +296,8 @@ def test_unknown_key_like_no_other_lists_the_known_ones(tmp_path):
 )
 def test_missing_keys(path, tmp_path):
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).lstrip(".")
-    assert complaint(without(*path), tmp_path) == f"{key}: missing"
+    advice = "; `wholearm plan` finds them, and in Python `wa.plan(wa.load_start(...), ...)`" if key == "phase" else ""
+    assert complaint(without(*path), tmp_path) == f"{key}: missing{advice}"
 
 
 # --- files that are no scenes ----------------------------------------------------------------------------------------

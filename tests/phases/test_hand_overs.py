@@ -120,12 +120,22 @@ def test_what_is_optimised_waits_by_either_contact(sliding):
 
 
 def test_a_hand_over_that_no_torque_survives_is_named():
-    scene, _, over = hand_over_of(box_scene(ROLL))
+    """Finger 2 is rough: what presses the vertex against it moves the tip along the edge."""
+    data = box_scene(SLIDE)
+    data["object"]["friction"] = {"palm": 0.1, "finger1": 0.1, "finger2": 0.9}
+    scene, _, over = hand_over_of(data)
     assert over.margin < 0
     optimum = wa.optimise(scene)
     assert optimum.result.status is not Status.OK
     assert "finger2:v3 hands over to finger2:e3 there, and no torque" in optimum.result.message
     assert "hand over elsewhere" in optimum.result.message
+
+
+def test_a_tip_does_not_roll_at_the_vertex_that_it_takes_over_at():
+    """It would be a corner on a corner all the way."""
+    optimum = wa.optimise(wa.parse(box_scene(ROLL)))
+    assert optimum.result.phases[1].status is Status.LEFT_FORMATION
+    assert "finger2:e3 rolling at the end of its feature, where it slips off" in optimum.result.message
 
 
 @pytest.mark.parametrize(
