@@ -514,6 +514,7 @@ def test_command(wholearm, tmp_path):
     assert "note: --push x=0.01@9: the execution ends at 2 s, before it" in err
     assert "palm:v5 opened: 1.0050 s predicted" in out
     assert "of 2 perturbed executions succeed" in out
+    assert "friction 10 %, mass 5 %, vertices 0.5 mm, start 0.5 mm: " in out
     assert out.splitlines()[-1].startswith("executed: ok, ")
     content = json.loads((tmp_path / "execution.json").read_text())
     assert content["status"] == "ok"

@@ -309,7 +309,11 @@ def test_the_command_says_what_may_help_that_has_not_been_tried(wholearm, tmp_pa
     assert code == 1
     assert "what may help: --time 60, for a longer search; --hand-from" in err
     assert "--regrasp-cost" not in err
-    assert "a start on another edge" in err
+    assert "a start on another edge and more friction at the palm" in err
+    shape = part_data()["object"] | {"friction": {"palm": 0.5, "finger1": 0.1, "finger2": 0.1}}
+    path = write_scene(tmp_path, object=shape)
+    _, _, err = wholearm("plan", path, "--phases", "1", "--by", "phi=-3", "--time", "0")
+    assert "a start on another edge: what lies flat" in err
 
 
 def test_the_command_says_what_a_finger_does_that_moves_alone(wholearm):

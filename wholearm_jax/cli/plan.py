@@ -126,7 +126,9 @@ def _hints(found, scene, limits: dict[str, Any], *, searched_hand: bool) -> list
         length, joint = (f"{0.6 * min(row):.3g}:{1.6 * max(row):.3g}" for row in (lengths, joints))
         hints.append(f"--hand-from length={length},joint={joint}, to search for the hand")
     if "phi" in found.goal.values:
-        hints.append("a start on another edge and more friction at the palm: what lies flat hardly tips")
+        palm, *fingers = (float(value) for value in scene.object.friction)
+        friction = " and more friction at the palm" if palm <= max(fingers) else ""
+        hints.append(f"a start on another edge{friction}: what lies flat hardly tips")
     return hints
 
 

@@ -73,6 +73,12 @@ class Amounts(NamedTuple):
     geometry: float = 0.0
     start: float = 0.0
 
+    def __str__(self) -> str:
+        relative = {"friction": self.friction, "mass": self.mass}
+        lengths = {"vertices": self.geometry, "start": self.start}
+        parts = [f"{name} {100 * width:.3g} %" for name, width in relative.items() if width]
+        return ", ".join(parts + [f"{name} {1e3 * width:.3g} mm" for name, width in lengths.items() if width])
+
 
 @dataclass(frozen=True)
 class PerturbedRun:
@@ -125,14 +131,15 @@ class TrialsResult:
 
     @property
     def message(self) -> str:
-        """The success rate in one line."""
+        """The success rate in one line, with what was perturbed."""
         low, high = self.interval
         share = 100 * self.successes / len(self.runs)
         span = f"95 % confidence interval {100 * low:.1f} to {100 * high:.1f} %"
         own = f"at the ends of their own paths: {self.own_successes}"
         kept = sum(run.least_force > 0 for run in self.runs)
+        by = f"{self.amounts}: " if any(self.amounts) else ""
         return (
-            f"{self.successes} of {len(self.runs)} perturbed executions succeed: {share:.1f} %, {span}; {own};"
+            f"{by}{self.successes} of {len(self.runs)} perturbed executions succeed: {share:.1f} %, {span}; {own};"
             f" all contacts kept on the way: {kept}"
         )
 
