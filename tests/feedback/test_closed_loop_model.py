@@ -22,6 +22,7 @@ from wholearm_jax.phases import (
     closed_loop_options,
     closed_loop_result,
     configuration,
+    ends_at_contact,
     initial_loop_carry,
     loop_step,
     phase_inputs,
@@ -121,7 +122,8 @@ def first_phase(thin, rougher, traced):
         dynamics = tabulate_path_dynamics(mechanics, path)
         changed = replace(tables, torque=tables.torque * torque)
         options = closed_loop_options(IntegratorOptions(tolerance=1e-11, adjoint=adjoint))
-        inputs = dynamics, phase_loop(law, changed, dynamics), changed, *phase_inputs(phase)
+        loop, at_contact = phase_loop(law, changed, dynamics), ends_at_contact(path)
+        inputs = dynamics, loop, changed, at_contact, *phase_inputs(phase)
         return loop_step(law, options, 0.01, initial_loop_carry(law), inputs)[1]
 
     return simulated
