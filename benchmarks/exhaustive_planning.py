@@ -25,7 +25,7 @@ from wholearm_jax.core import as_device_array
 from wholearm_jax.model import COORDINATES, object_radius
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import Move, moves_from
-from wholearm_jax.planning.plans import Plan, Step, make_plan
+from wholearm_jax.planning.plans import Plan, Step, contact_left, make_plan
 from wholearm_jax.planning.successors import touching_contacts
 
 CANDIDATES = 200  # formations of plans that are kept for each goal, those of the largest margins at rest
@@ -58,8 +58,7 @@ def explore(scene: wa.Scene, goals: dict[str, Goal], depth: int, places: int, ce
     level, nodes, paths = [Node(np.inf, start, (), touching_contacts(scene, as_device_array(start)))], 0, 0
 
     def expand(node: Node) -> tuple[Move, ...]:
-        left = node.steps[-1].leaves if node.steps else None
-        return moves_from(scene, as_device_array(node.z), node.touching, left=left)
+        return moves_from(scene, as_device_array(node.z), node.touching, left=contact_left(node.steps))
 
     with ThreadPoolExecutor(2) as threads:
         for number in range(depth):

@@ -27,7 +27,7 @@ from wholearm_jax.model import COORDINATES, object_radius, resting_configuration
 from wholearm_jax.phases import describe_overlaps
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import moves_from
-from wholearm_jax.planning.plans import Step, make_plan
+from wholearm_jax.planning.plans import Step, contact_left, make_plan
 from wholearm_jax.planning.successors import touching_contacts
 from wholearm_jax.plotting.palette import CONTACT_COLOURS
 
@@ -115,8 +115,8 @@ def random_tree(scene: wa.Scene, by: dict, seconds: float, seed: int, max_phases
         z, steps, names = nodes[int(np.argmin(apart))] if rng.random() < 0.5 else nodes[rng.integers(len(nodes))]
         if len(steps) == max_phases:
             continue
-        left = steps[-1].leaves if steps else None
-        moves = [move for move in moves_from(scene, as_device_array(z), names, left=left) if move.margins[0] > 0]
+        every = moves_from(scene, as_device_array(z), names, left=contact_left(steps))
+        moves = [move for move in every if move.margins[0] > 0]
         if not moves:
             continue
         move = moves[rng.integers(len(moves))]

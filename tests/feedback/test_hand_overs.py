@@ -103,7 +103,7 @@ def test_a_vertex_meets_a_fingers_face_as_far_as_its_tip(box, beyond, touches):
 
 
 @pytest.fixture(scope="module")
-def short_way():
+def short_path():
     """A pentagon that a fingertip pushes by 3.5 mm to a vertex, and the finger, which takes over there, by 9 mm."""
     finger = {"length": 0.1383, "inertia": 1.08e-3, "viscous": 0.005, "dry": 0.01, "torque_limit": 5.0}
     finger["range"] = [0.3, 2.8]
@@ -115,7 +115,7 @@ def short_way():
     phases[1]["until"] = {"x": -0.0125}
     scene = wa.parse(
         {
-            "title": "a short way to a hand-over",
+            "title": "a short path to a hand-over",
             "gravity": [-3.0, -9.0],
             "hand": {
                 "fingers": "layered",
@@ -138,21 +138,21 @@ def of_other_friction(scene):
     return [eqx.tree_at(lambda s: s.object.friction, scene, k * scene.object.friction) for k in (0.9, 0.95, 1.05, 1.1)]
 
 
-def test_a_law_that_lets_objects_stop_short_is_none(short_way):
+def test_a_law_that_lets_objects_stop_short_is_none(short_path):
     """Each contact is kept, but the object does not come to the hand-over, or runs beyond it."""
-    slow = feedback(short_way.scene, short_way.torque, friction=0.1, stiffness=26.0, integral=4.3, observer=87.0)
-    checked = wa.check(of_other_friction(short_way.scene), controller=slow)
+    slow = feedback(short_path.scene, short_path.torque, friction=0.1, stiffness=26.0, integral=4.3, observer=87.0)
+    checked = wa.check(of_other_friction(short_path.scene), controller=slow)
     assert (checked.margin > 0).all()
     assert not (checked.status == wa.Status.OK).all()
     assert slow.margin == -np.inf
 
 
-def test_a_motion_that_is_slow_at_a_hand_over_has_the_rates_of_a_faster_one(short_way):
-    law = feedback(short_way.scene, short_way.torque, friction=0.1)
+def test_a_motion_that_is_slow_at_a_hand_over_has_the_rates_of_a_faster_one(short_path):
+    law = feedback(short_path.scene, short_path.torque, friction=0.1)
     assert law.margin > 0
     assert law.stiffness > 40
-    checked = wa.check(of_other_friction(short_way.scene), controller=law)
+    checked = wa.check(of_other_friction(short_path.scene), controller=law)
     assert (checked.status == wa.Status.OK).all()
-    done = execute(short_way.result, timestep=2e-4, controller=law)
+    done = execute(short_path.result, timestep=2e-4, controller=law)
     assert done.ending.value == "ok"
     assert done.position_error < 5e-4

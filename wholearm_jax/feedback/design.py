@@ -60,7 +60,7 @@ class Part(NamedTuple):
     scene: Scene
     paths: tuple[TracedPhase, ...]
     is_held: bool
-    has_own_shape: bool
+    has_other_shape: bool
 
 
 class Approach(NamedTuple):
@@ -112,8 +112,8 @@ def feedback(
         ValueError: For numbers that are out of range, for a plan whose paths cannot be traced, where both joints stand
             still on a path, and where a schedule fails whose motion is asked for.
     """
-    wanted = {"stiffness": stiffness, "integral": integral, "observer": observer}
-    given = {name: rate for name, rate in wanted.items() if rate is not None}
+    rates = {"stiffness": stiffness, "integral": integral, "observer": observer}
+    given = {name: rate for name, rate in rates.items() if rate is not None}
     require_positive(**given)
     if not (0 <= friction < 1 and 0 <= mass < 1):
         raise ValueError("friction, mass: shares of at least 0 and less than 1")
@@ -137,8 +137,8 @@ def feedback(
     ]
     either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
     limit, units = RESERVE * np.asarray(scene.hand.torque_limit), cost_units(scene)
-    parts = [Part(*each, is_held=True, has_own_shape=False) for each in zip(scenes, traces, strict=True)]
-    parts += [Part(*each, is_held=bool(held), has_own_shape=True) for each in zip(shapes, drawn, strict=True)]
+    parts = [Part(*each, is_held=True, has_other_shape=False) for each in zip(scenes, traces, strict=True)]
+    parts += [Part(*each, is_held=bool(held), has_other_shape=True) for each in zip(shapes, drawn, strict=True)]
     laws = []
     for group in group_phases(scene):
         options = _motions(scene, group, tables, approaches, trajectory(result), own_motion)
@@ -148,28 +148,30 @@ def feedback(
         best = max(range(len(choices)), key=lambda option: _worst_first(choices[option]))
         for k, motion, choice in zip(group, options[best], choices[best], strict=True):
             laws.append(_phase_law(scene, k, tables[k], terms[k][0], motion, choice, approaches[k], parts))
-    slow, found = slowness(scene), []
-    for rates in _default_rates(scene, tables)[: 1 if len(given) == len(RATES) else None]:
-        controller = Controller(
-            title=scene.title,
-            phases=tuple(laws),
-            **rates | given,
-            push=_push(scene),
-            felt=(FELT[0] / slow, FELT[1] * slow),
-            patience=LONGEST_DELAY * slow,
-            torque_limit=np.asarray(scene.hand.torque_limit),
-        )
-        found.append(_with_simulated_margins(controller, parts))
-        if found[-1].margin > 0:
-            break
-    return max(found, key=lambda controller: controller.margin)
+    slow = slowness(scene)
+    first, *others = [defaults | given for defaults in _default_rates(scene, tables)]
+    controller = Controller(
+        title=scene.title,
+        phases=tuple(laws),
+        **first,
+        push=_push(scene),
+        felt=(FELT[0] / slow, FELT[1] * slow),
+        patience=LONGEST_DELAY * slow,
+        torque_limit=np.asarray(scene.hand.torque_limit),
+    )
+    held = _with_simulated_margins(controller, parts)
+    for faster in others if held.margin <= 0 else ():
+        if faster != first:  # not all rates are given
+            another = _with_simulated_margins(replace(controller, **faster), parts)
+            held = max(held, another, key=lambda one: one.margin)
+    return held
 
 
 def _default_rates(scene: Scene, tables: list[PathTable]) -> list[dict[str, float]]:
     """Return rates of the loop to try: less for large objects, and for motions so slow that an encoder's steps reverse.
 
     Each step of the measured angle moves the object at about `w` times the step, which is too much for slow motions.
-    But the loop has to settle within the shortest phase, also where another one is so short a way that it is slow; and
+    But the loop has to settle within the shortest phase, also where another one is so short a path that it is slow; and
     where no law holds at the lower rates, one may at those of faster motions.
     """
     durations = [float(phase.duration) for phase in scene.phases]
@@ -212,7 +214,7 @@ def _with_simulated_margins(controller: Controller, parts: list[Part]) -> Contro
 
 def _least_force(phase: SimulatedPhase, part: Part) -> float:
     """Return the least force of a simulated phase [N]; minus infinity where it does not end as it should."""
-    ends = part.has_own_shape or int(phase.assessment.status) in (Status.OK, Status.CONTACT_LOST)
+    ends = part.has_other_shape or int(phase.assessment.status) in (Status.OK, Status.CONTACT_LOST)
     return float(phase.margin_result.margin) if ends else -np.inf
 
 

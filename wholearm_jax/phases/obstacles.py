@@ -24,7 +24,7 @@ from wholearm_jax.model import (
     rigid_body,
     scaled_mechanics,
 )
-from wholearm_jax.tracing import hold_same_tip, lie_before_link, pivot_clearance, run_into_object
+from wholearm_jax.tracing import feature_clearance, hold_same_tip, lie_before_link, pivot_clearance, run_into_object
 
 STRETCH_PLACES = 17  # of a link's stretch in the object, at which its depth is looked at
 LEVEL_ANGLE = 1e-9  # [rad], within which a finger is level with the palm
@@ -91,13 +91,10 @@ def describe_refused_start(scene: Scene, phase: Phase, z: Float[Array, "5"]) -> 
     A fingertip at a vertex is named where two contacts hold it, where the finger would cut the vertex off, and where a
     contact rolls there; a vertex where the object lies behind the link that it touches.
     """
-    along, lower, upper, twice, inward, clearance = (
-        np.asarray(a) for a in _formation_places(scene, phase.formation, z)
-    )
-    beyond = np.maximum(lower - along, along - upper)
+    inside, pivots, twice, inward = (np.asarray(a) for a in _formation_places(scene, phase.formation, z))
     names = [phase.formation.names[k] for k in phase.formation.contact_of_row]
     misplaced = dict.fromkeys(
-        f"{names[k]} lies {1e3 * beyond[k]:.3g} mm beyond its feature" for k in np.flatnonzero(beyond > 1e-9)
+        f"{names[k]} lies {-1e3 * inside[k]:.3g} mm beyond its feature" for k in np.flatnonzero(inside < -1e-9)
     )
     corners = [
         f"{names[i]} and {names[j]} hold a tip at a vertex, where it slips off along either side: keep one of the two"
@@ -106,7 +103,7 @@ def describe_refused_start(scene: Scene, phase: Phase, z: Float[Array, "5"]) -> 
     corners += [f"{names[k]}: the finger comes from the object's side of that edge" for k in np.flatnonzero(inward)]
     corners += [
         f"{names[k]} at the end of its feature, where it slips off: let the phase before it end sooner"
-        for k in np.flatnonzero(clearance < CORNER_TOL * object_radius(scene.object))
+        for k in np.flatnonzero(np.abs(pivots) < CORNER_TOL * object_radius(scene.object))
     ]
     corners += _touched_from_behind(scene, phase.formation, z)
     return "; ".join((*describe_overlaps(scene, z), *misplaced, *corners)) or None
@@ -138,7 +135,7 @@ def _formation_places(scene: Scene, formation: ContactFormation, z):
     at = contact_kinematics(contacts, z)
     twice = hold_same_tip(contacts, at, contacts, at)
     inward = run_into_object(contacts, at, z, body.flush_tolerance)
-    return at.along, contacts.lower, contacts.upper, twice, inward, pivot_clearance(contacts, at)
+    return feature_clearance(contacts, at), pivot_clearance(contacts, at), twice, inward
 
 
 def _object_overlaps(scene: Scene, z, tolerance: float) -> list[str]:

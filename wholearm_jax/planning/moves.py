@@ -29,7 +29,7 @@ from wholearm_jax.model import (
 from wholearm_jax.phases import configuration, trace_phase
 from wholearm_jax.planning.path_choices import path_choices
 from wholearm_jax.planning.successors import touching_contacts
-from wholearm_jax.tracing import PathEnd, Resolution, pivot_clearance
+from wholearm_jax.tracing import PathEnd, Resolution, feature_clearance, pivot_clearance
 
 MOVES_PER_CALL = 8  # paths that one call of the program traces; the last call is filled up
 SHORTEST_MOVE = 0.02  # path length, in the object's radii, below which a hand cannot tell a move from standing still
@@ -163,7 +163,7 @@ def _trace_moves(body, hand, gravity, formations, targets, z) -> _Paths:
         # Where does the contact that leaves its feature, if one does, come near the end?
         reason, contact = traced.path.end_reason, traced.path.end_contact
         left = jnp.minimum(contact, at.along.shape[1] - 1)
-        inside = jnp.minimum(at.along - mechanics.contacts.lower, mechanics.contacts.upper - at.along)[:, left]
+        inside = feature_clearance(mechanics.contacts, at)[:, left]
         secure = jnp.where(inside >= LEAST_HOLD, jnp.arange(PLACES), 0).max()
         return _Paths(dynamics.status, dynamics.length, pivot, places, margins, reason, contact, secure)
 

@@ -29,6 +29,11 @@ class Step:
     delay: float = 0.0  # by how many phases later the search goes on from there
 
 
+def contact_left(steps: tuple[Step, ...]) -> str | None:
+    """Name the contact, if any, that is at its feature's end after some steps."""
+    return steps[-1].leaves if steps else None
+
+
 @dataclass(frozen=True)
 class Plan:
     """Phases that lead to the goal, as a scene that `optimise` takes as it is."""

@@ -40,6 +40,7 @@ from wholearm_jax.planning.plans import (
     Plan,
     PlanningResult,
     Step,
+    contact_left,
     make_plan,
     survives_hand_over,
 )
@@ -253,7 +254,7 @@ def _add_plan(search: _Search, steps: tuple[Step, ...]) -> None:
 def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tuple[str, ...] | None) -> None:
     """Add a configuration to the queues unless it is there already, or no plan may go on from it."""
     unit = np.array([search.radius, search.radius, 1, 1, 1])
-    key = (steps[-1].leaves if steps else None, *np.round(z / unit / MERGE_TOL).astype(int).tolist())
+    key = (contact_left(steps), *np.round(z / unit / MERGE_TOL).astype(int).tolist())
     arrived = search.goal.is_reached(z)
     if key in search.visited and not arrived:  # other ways to the goal are other plans
         return
@@ -290,7 +291,7 @@ def _phases_to_go(search: _Search, z: np.ndarray) -> float:
 def _expand(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching) -> None:
     """Trace all moves from a configuration and push the places at which they may be left."""
     regrasps = search.regrasp_cost is not None
-    left, here = steps[-1].leaves if steps else None, as_device_array(z)
+    left, here = contact_left(steps), as_device_array(z)
     moves = moves_from(search.scene, here, touching, left=left, rolling=search.rolling, regrasps=regrasps)
     search.nodes += 1
     search.moves += len(moves)

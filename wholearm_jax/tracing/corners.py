@@ -46,6 +46,11 @@ def _hold_gap(contacts: ContactSet) -> Bool[Array, "rows"]:
     return ~contacts.tangential if contacts.is_away is None else ~contacts.tangential & ~contacts.is_away
 
 
+def feature_clearance(contacts: ContactSet, at: ContactKinematics) -> Float[Array, "*places rows"]:
+    """How far contacts are from the nearer end of their features; negative beyond it."""
+    return jnp.minimum(at.along - contacts.lower, contacts.upper - at.along)
+
+
 def pivot_clearance(contacts: ContactSet, at: ContactKinematics) -> Float[Array, "rows"]:
     """How far contacts that roll are from the ends of their features; infinite for those that do not.
 
@@ -55,8 +60,7 @@ def pivot_clearance(contacts: ContactSet, at: ContactKinematics) -> Float[Array,
         contacts: of a formation.
         at: their kinematics.
     """
-    inside = jnp.minimum(at.along - contacts.lower, contacts.upper - at.along)
-    return jnp.where(contacts.tangential, inside, jnp.inf)
+    return jnp.where(contacts.tangential, feature_clearance(contacts, at), jnp.inf)
 
 
 def run_into_object(

@@ -22,7 +22,7 @@ from wholearm_jax.model import (
     link_overlaps,
     next_vertex,
 )
-from wholearm_jax.tracing.corners import hold_same_tip, pivot_clearance, run_into_object
+from wholearm_jax.tracing.corners import feature_clearance, hold_same_tip, pivot_clearance, run_into_object
 
 
 def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) -> Bool[Array, ""]:
@@ -37,9 +37,7 @@ def violates_contact_limits(mechanics: ScaledMechanics, z: Float[Array, "5"]) ->
     tolerance = eps_power(z, 5 / 8)
     flush_tolerance = jnp.maximum(tolerance, mechanics.flush_tolerance)
     contacts, pairs = contact_kinematics(mechanics.contacts, z), contact_kinematics(mechanics.candidates, z)
-    beyond = (contacts.along < mechanics.contacts.lower - tolerance) | (
-        contacts.along > mechanics.contacts.upper + tolerance
-    )
+    beyond = feature_clearance(mechanics.contacts, contacts) < -tolerance
     inside = (pairs.along > mechanics.candidates.lower) & (pairs.along < mechanics.candidates.upper)
     behind = (
         mechanics.may_terminate
