@@ -1,6 +1,8 @@
 """Plans from a start and a goal: traced anew, they arrive; where there is none, the reason is right."""
 
+import itertools
 import json
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,9 +15,11 @@ from support import layered
 import wholearm_jax as wa
 from wholearm_jax.files import load_goal, load_start
 from wholearm_jax.files.scene_toml import SceneError, to_dict
-from wholearm_jax.model import resting_configuration
+from wholearm_jax.model import COORDINATES, resting_configuration
 from wholearm_jax.planning.goal import make_goal
+from wholearm_jax.planning.improvement import is_secure
 from wholearm_jax.planning.moves import moves_from
+from wholearm_jax.planning.plans import make_plan
 from wholearm_jax.planning.search import SHORT_PLAN
 from wholearm_jax.planning.successors import successor_formations
 
@@ -98,6 +102,39 @@ def test_no_plan_goes_on_with_a_contact_at_the_very_end_of_its_feature():
                 clearances.append(0.1457 - np.hypot(across, above))
     assert len(clearances) >= 3
     assert min(clearances) > 1e-3
+
+
+@pytest.fixture(scope="module")
+def shifted_and_turned(part):
+    return wa.plan(part, by={"x": -0.02, "phi": -0.3}, count=1, max_nodes=40)
+
+
+def test_the_certificate_is_largest_at_the_places_where_phases_change(part, shifted_and_turned):
+    """Thirds of paths, where the search leaves them, allow 0.0004 N."""
+    (best,) = shifted_and_turned.plans
+    places = [k for k, step in enumerate(best.steps[:-1]) if step.until is not None]
+    assert len(places) >= 2
+    for k, share in itertools.product(places, (-0.02, 0.02)):
+        name, value = best.steps[k].until
+        way = (best.ends[k] - best.begins[k])[COORDINATES.index(name)]
+        data = to_dict(best.scene)
+        data["phase"][k]["until"] = {name: value + share * float(way)}
+        moved = wa.parse(data)
+        if shifted_and_turned.goal.is_reached(np.asarray(wa.trace(moved)[-1].end)):
+            assert min(float(one.value) for one in wa.bounds(moved)) < 1.005 * best.bound
+
+
+def test_a_place_moved_beyond_its_path_is_no_plan(part, shifted_and_turned):
+    (best,) = shifted_and_turned.plans
+    assert is_secure(best, regrasps=False)
+    k = next(k for k, step in enumerate(best.steps) if step.until is not None)
+    name, _ = best.steps[k].until
+    way = (best.ends[k] - best.begins[k])[COORDINATES.index(name)]
+    step = replace(best.steps[k], until=(name, float(best.ends[k][COORDINATES.index(name)] + 20 * way)))
+    beyond = make_plan(
+        part, shifted_and_turned.start, (*best.steps[:k], step, *best.steps[k + 1 :])[: k + 2], 1.0, None
+    )
+    assert beyond is None or not is_secure(beyond, regrasps=False)
 
 
 @pytest.mark.slow

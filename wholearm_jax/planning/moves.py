@@ -96,16 +96,27 @@ def moves_from(
         return ()
     first, others = _trace(scene, z, regrasps, parts[0]), parts[1:]  # compiles, once
     traced = [first, *_threads().map(functools.partial(_trace, scene, z, regrasps), others)]
-    moves = []
-    for part, paths in zip(parts, traced, strict=True):
-        for k, (contacts, toward) in enumerate(part):
-            row = jax.tree.map(lambda a, k=k: a[k], paths)
-            if row.status == Status.OK and row.length >= SHORTEST_MOVE and row.pivot >= LEAST_HOLD:
-                reason, contact = int(row.end_reason), int(row.end_contact)
-                leaves = _contact_of_row(contacts, contact) if reason == PathEnd.FEATURE_END else None
-                path = float(row.length), row.places, row.margins
-                moves.append(Move(contacts, toward, *path, reason, contact, leaves, int(row.secure)))
-    return tuple(moves)
+    pairs = [(choice, paths, k) for part, paths in zip(parts, traced, strict=True) for k, choice in enumerate(part)]
+    moves = (_as_move(*choice, jax.tree.map(lambda a, k=k: a[k], paths)) for choice, paths, k in pairs)
+    return tuple(move for move in moves if move is not None)
+
+
+def move_along(
+    scene: Scene, z: Float[Array, "5"], contacts: Sequence[str], toward: str, *, regrasps: bool
+) -> Move | None:
+    """Return the move of one formation in one direction; None where it is none that `moves_from` returns."""
+    choice = (tuple(contacts), toward)
+    return _as_move(*choice, jax.tree.map(lambda a: a[0], _trace(scene, z, regrasps, [choice])))
+
+
+def _as_move(contacts: tuple[str, ...], toward: str, path) -> Move | None:
+    """Return a move from what the program returns for it; None where it cannot be traced, or a hand may miss it."""
+    if path.status != Status.OK or path.length < SHORTEST_MOVE or path.pivot < LEAST_HOLD:
+        return None
+    reason, contact = int(path.end_reason), int(path.end_contact)
+    leaves = _contact_of_row(contacts, contact) if reason == PathEnd.FEATURE_END else None
+    curve = float(path.length), path.places, path.margins
+    return Move(contacts, toward, *curve, reason, contact, leaves, int(path.secure))
 
 
 @functools.cache

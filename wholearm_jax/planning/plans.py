@@ -81,11 +81,17 @@ class PlanningResult:
 
 
 def make_plan(
-    scene: Scene, start: Float[np.ndarray, "5"], steps: tuple[Step, ...], duration: float, goal: Goal | None
+    scene: Scene,
+    start: Float[np.ndarray, "5"],
+    steps: tuple[Step, ...],
+    duration: float,
+    goal: Goal | None,
+    floor: float = -np.inf,
 ) -> Plan | None:
     """Trace steps as a plan at full resolution.
 
-    None where a phase cannot be traced, no torque survives a hand-over between two, or the goal is missed.
+    None where a phase cannot be traced, no torque survives a hand-over between two, the goal is missed, or the
+    certificate is not above the floor.
     """
     planned = _as_scene(scene, start, steps, duration)
     traced = trace(planned)
@@ -98,10 +104,12 @@ def make_plan(
     reasons = tuple(describe_end(planned, phase, one) for phase, one in zip(phases, traced, strict=True))
     if any(over is not None and not over.margin > 0 for over in find_hand_overs(planned, traced)):
         return None
-    values = tuple(
-        float(_phase_bound(one.dynamics, phase.duration).value) for phase, one in zip(phases, traced, strict=True)
-    )
-    return Plan(planned, steps, tuple(np.asarray(one.begin) for one in traced), ends, reasons, values)
+    bounds = np.full(len(steps), np.nan)
+    for k in np.argsort([step.margin for step in steps]):  # the phase first that is likely to limit the plan
+        bounds[k] = float(_phase_bound(traced[k].dynamics, phases[k].duration).value)
+        if not bounds[k] > floor:
+            return None
+    return Plan(planned, steps, tuple(np.asarray(one.begin) for one in traced), ends, reasons, tuple(bounds.tolist()))
 
 
 def _as_scene(scene: Scene, start: Float[np.ndarray, "5"], steps: tuple[Step, ...], duration: float) -> Scene:

@@ -8,9 +8,11 @@ below the floor. Two orders take turns: by their sum, for plans of up to `SHORT_
 the estimate, which goes for a plan of any length. A plan that is found is traced anew, at full resolution, and judged
 by its certificate: the least upper bound of its phases.
 Once there are as many plans as wanted, the floor rises to the least certificate among them, so that from then on only
-better ones count; the search ends when it has gone on as long again without finding one.
+better ones count; the search ends when it has gone on as long again without finding one. Last, the places between the
+phases of the plans that are kept move until their certificates are as large as they get (`improve_plan`).
 """
 
+import functools
 import heapq
 import itertools
 import time
@@ -33,6 +35,7 @@ from wholearm_jax.model import (
 )
 from wholearm_jax.phases import describe_overlaps, possible_hand_overs, trace
 from wholearm_jax.planning.goal import Goal, make_goal
+from wholearm_jax.planning.improvement import improve_plan, is_secure
 from wholearm_jax.planning.moves import Move, moves_from
 from wholearm_jax.planning.obstructions import explain_failure, explain_far_goal
 from wholearm_jax.planning.plans import (
@@ -153,6 +156,8 @@ def plan(
     _push(search, start, (), touching)
     out_of_time = _run(search, time_limit, max_nodes, callback)
     nearest, reason = None, ""
+    again = functools.partial(_make_secure_plan, search)
+    improved = [improve_plan(one, search.radius, again) for one in search.plans]
     if not search.plans:
         steps = search.nearest[1]
         nearest = make_plan(scene, start, steps, duration, None) if steps else None
@@ -163,7 +168,7 @@ def plan(
     return PlanningResult(
         start=start,
         goal=search.goal,
-        plans=tuple(search.plans),
+        plans=tuple(_ranked(search, improved)),
         nearest=nearest,
         reason=reason,
         nodes=search.nodes,
@@ -236,10 +241,10 @@ def _has_lost_patience(search: _Search) -> bool:
 
 def _add_plan(search: _Search, steps: tuple[Step, ...]) -> None:
     """Trace steps as a plan, and keep it if it arrives and is among the best; the floor rises to the last of these."""
-    found = make_plan(search.scene, search.start, steps, search.duration, search.goal)
-    if found is None or found.bound <= search.floor:
+    found = _make_plan(search, steps, search.floor)
+    if found is None:
         return
-    ranked = sorted([*search.plans, found], key=lambda one: (-round(one.bound, 6), _cost(search, one.steps)))
+    ranked = _ranked(search, [*search.plans, found])
     different = {}  # plans of the same formations that change elsewhere are one
     for one in ranked:
         different.setdefault(tuple((step.contacts, step.toward) for step in one.steps), one)
@@ -249,6 +254,23 @@ def _add_plan(search: _Search, steps: tuple[Step, ...]) -> None:
     search.plans[:] = list(different.values())[: search.count]
     if len(search.plans) == search.count:
         search.floor = search.plans[-1].bound
+
+
+def _make_plan(search: _Search, steps: tuple[Step, ...], floor: float) -> Plan | None:
+    """Trace steps as a plan with a certificate above a floor, if they are one."""
+    return make_plan(search.scene, search.start, steps, search.duration, search.goal, floor)
+
+
+def _make_secure_plan(search: _Search, steps: tuple[Step, ...], floor: float) -> Plan | None:
+    """Trace steps as a plan, if they are one that the search itself might have found."""
+    found = _make_plan(search, steps, floor)
+    regrasps = search.regrasp_cost is not None
+    return found if found is not None and is_secure(found, regrasps=regrasps) else None
+
+
+def _ranked(search: _Search, plans: list[Plan]) -> list[Plan]:
+    """Sort plans: the largest certificate first, then fewer phases."""
+    return sorted(plans, key=lambda one: (-round(one.bound, 6), _cost(search, one.steps)))
 
 
 def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tuple[str, ...] | None) -> None:
