@@ -14,6 +14,7 @@ from wholearm_jax.feedback.path_table import tabulate_path
 from wholearm_jax.feedback.reference_motion import passing_motion, smooth_motions
 from wholearm_jax.feedback.stop_places import draw_shapes, stop_places
 from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop
+from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.model import object_radius, rigid_body
 
 SHAPE = 5e-4
@@ -115,6 +116,28 @@ def test_a_push_squeezes_an_object_that_milder_ones_tip(heptagon, monkeypatch):
     assert stop.statics.margin_under(pressed).margin > 0
     alone = choose_push([stop], torque, np.ones(2), either_finger=False)
     np.testing.assert_allclose(alone[1] / np.hypot(*alone[1]), ahead, err_msg="one finger alone has no choice")
+
+
+def test_parts_that_need_not_be_held_spoil_no_push_at_a_stop(tmp_path):
+    """No push holds a rounded plate and all parts that are a little off its shape where the next vertex comes."""
+    turns = np.pi / 8 * np.arange(5)
+    middles = {-np.pi / 2: (70, 10), 0.0: (70, 40), np.pi / 2: (10, 40), np.pi: (10, 10)}
+    arcs = [np.add(at, 10 * np.column_stack([np.cos(a + turns), np.sin(a + turns)])) for a, at in middles.items()]
+    rows = np.roll(np.vstack(arcs), 1, axis=0)
+    (tmp_path / "plate.csv").write_text("x [mm],y [mm]\n" + "\n".join(f"{x:.6f},{y:.6f}" for x, y in rows))
+    friction = {"palm": 0.5, "finger1": 0.1, "finger2": 0.1}
+    scene = wa.scene_from_outline(wa.read_outline(tmp_path / "plate.csv"), friction=friction)
+    slide = {"name": "slide", "contacts": ["palm:v0", "palm:v1", "finger1:v7", "finger2:v14"], "toward": "x-"}
+    scene = wa.parse(to_dict(scene) | {"phase": [slide | {"duration": 1.0}]})
+    result = wa.simulate(scene, wa.quasistatic(scene))
+    controller = feedback(scene, result.torque, friction=0.05)
+    assert controller.margin > 0
+    (law,) = controller.phases
+    under = law.torque[-1] + law.press * law.gain[-1]
+    for one in corner_scenes(scene, 0.05, 0.0):
+        stop = object_at_stop(one, scene.phases[0], wa.trace(one)[0])
+        assert stop.acceleration[0] + under @ stop.acceleration[3:] >= 5.0
+        assert stop.statics.margin_under(under).margin > 0
 
 
 def test_a_push_that_tips_objects_over_their_stop_makes_the_margin_negative(heptagon, monkeypatch):

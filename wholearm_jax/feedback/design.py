@@ -10,8 +10,16 @@ from jaxtyping import Float, Int
 
 from wholearm_jax.core import Status, require_positive
 from wholearm_jax.feedback.controller import Controller, PhaseLaw
+from wholearm_jax.feedback.either_formation import find_takeovers, with_either_formation
 from wholearm_jax.feedback.law_tables import law_tables
-from wholearm_jax.feedback.path_table import PathTable, PathTerms, path_terms, tabulate_path, terms_of_other_shape
+from wholearm_jax.feedback.path_table import (
+    PathTable,
+    PathTerms,
+    path_terms,
+    tabulate_path,
+    terms_of_other_shape,
+    with_facets,
+)
 from wholearm_jax.feedback.reference_motion import (
     PASSING,
     ReferenceMotion,
@@ -20,7 +28,7 @@ from wholearm_jax.feedback.reference_motion import (
     smooth_motions,
 )
 from wholearm_jax.feedback.stop_places import SHAPES_AT_STOPS, draw_shapes, has_paths, stop_places
-from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop, slowness, stays_at_stop
+from wholearm_jax.feedback.stop_torque import StopStatics, choose_push, object_at_stop, slowness, stays_at_stop
 from wholearm_jax.feedback.torque_choice import CostUnits, TorqueChoice, choose_torques, cost_units
 from wholearm_jax.model import Arrival, Scene, TorqueSchedule
 from wholearm_jax.phases import (
@@ -30,7 +38,6 @@ from wholearm_jax.phases import (
     TracedPhase,
     ends_at_stop,
     group_phases,
-    hand_over_contacts,
     require_motion,
     simulate,
     simulate_closed_loop,
@@ -51,7 +58,6 @@ SLOW_SHARE = 0.4  # of a phase's duration, at most, that the reference takes to 
 FELT = (0.05, 0.03)  # speed [rad/s] below which such an object stands, and for how long [s]
 LONGEST_DELAY = 1.0  # longest time beyond a phase's duration, for such an object [s]
 ASIDE = 0.02  # how far an object may be from the reference's place on its path: 0.5 mm of a radius of 25 mm [rad]
-UNSURE = 0.005  # distance from a corner within which angles do not tell its sides: 3 counts of 4096 a turn [rad]
 
 
 class Part(NamedTuple):
@@ -135,7 +141,7 @@ def feedback(
         _terms_of_set(table, [paths[k] for paths in traces], [paths[k] for paths in held if has_paths(paths[: k + 1])])
         for k, table in enumerate(tables)
     ]
-    either = _with_either_formation(tables, terms, _hand_overs(scene, traces[0]))
+    either = with_either_formation(tables, terms, find_takeovers(scene, traces[0]))
     limit, units = RESERVE * np.asarray(scene.hand.torque_limit), cost_units(scene)
     parts = [Part(*each, is_held=True, has_other_shape=False) for each in zip(scenes, traces, strict=True)]
     parts += [Part(*each, is_held=bool(held), has_other_shape=True) for each in zip(shapes, drawn, strict=True)]
@@ -286,49 +292,11 @@ def _motions(scene: Scene, group, tables, approaches, courses, own_motion: bool)
     return options
 
 
-def _hand_overs(scene: Scene, traced: tuple[TracedPhase, ...]) -> list[bool]:
-    """Say of each two phases whether a vertex and a fingertip take over from one another between them, at rest."""
-    pairs = zip(scene.phases[:-1], traced[:-1], scene.phases[1:], strict=True)
-    return [hand_over_contacts(scene, *pair) is not None for pair in pairs]
-
-
-def _with_either_formation(
-    tables: list[PathTable], terms: list[list[PathTerms]], hand_overs: list[bool]
-) -> list[list[PathTerms]]:
-    """Add, next to each hand-over, the objects as the other formation holds them.
-
-    Measured angles do not tell there which of the two holds the object: the law has to move it under both, and the
-    torques that move it under the one must not lose it under the other, which takes over at once.
-    """
-    found = [[*each] for each in terms]
-    for k in np.flatnonzero(hand_overs):
-        near_end = tables[k].s > tables[k].s[-1] - UNSURE
-        near_start = tables[k + 1].s < UNSURE
-        for before, after in zip(*terms[k : k + 2], strict=True):
-            found[k] += _either(before, near_end, after, 0)
-            found[k + 1] += _either(after, near_start, before, -1)
-    return found
-
-
-def _either(own: PathTerms, rows, other: PathTerms, at: int) -> list[PathTerms]:
-    """Put one place of another path in some rows of a path's terms: all of it, how it moves, and what it must keep."""
-    facets = max(own.slack.shape[1], other.slack.shape[1])
-    slack, there = (_with_facets(each.slack, facets) for each in (own, other))
-    moves = np.where(rows[:, None], other.acceleration[at], own.acceleration)
-    keeps = np.where(rows[:, None, None], there[at], slack)
-    return [PathTerms(moves, keeps), PathTerms(moves, slack), PathTerms(own.acceleration, keeps)]
-
-
-def _with_facets(slack: Float[np.ndarray, "nodes facets 5"], count: int) -> Float[np.ndarray, "nodes count 5"]:
-    """Repeat the last facet until there are `count`, as formations of fewer contacts have fewer."""
-    return np.take(slack, np.arange(count), axis=1, mode="clip")
-
-
 def _choose(every: list[PathTerms], table: PathTable, limit, motion: ReferenceMotion, units: CostUnits) -> TorqueChoice:
     """Choose torques and gains at the nodes next to a motion's places."""
     nodes = _nearest(table, motion.s)
     facets = max(terms.slack.shape[1] for terms in every)
-    at = [PathTerms(terms.acceleration, _with_facets(terms.slack, facets)).at(nodes) for terms in every]
+    at = [PathTerms(terms.acceleration, with_facets(terms.slack, facets)).at(nodes) for terms in every]
     return choose_torques(at, limit, motion.v, motion.a, units)
 
 
@@ -364,15 +332,9 @@ def _phase_law(
     press, speed = 0.0, APPROACH / slowness(scene)
     reach = approach.reach if approach is not None else 0.0
     if approach is not None and not flows:
-        stopped = [part for part in parts if has_paths(part.paths[: k + 1])]
-        stops = [object_at_stop(part.scene, phase, part.paths[k]) for part in stopped]
-        limit, either = np.asarray(scene.hand.torque_limit), not phase.has_free_finger
-        press, gain_at_stop = choose_push(stops, choice.torque[-1], limit, either_finger=either)
-        gain[table.s > table.s[-1] - reach] = gain_at_stop
-        held = [stop for stop, part in zip(stops, stopped, strict=True) if part.is_held]
-        pressed = choice.torque[-1] + press * gain_at_stop
         speed = approach.speed
-        margin = min(margin, *(stop.pressed_over(pressed, speed, either_finger=either) for stop in held))
+        press, gain_at_stop, held = _push_at_stop(scene, k, parts, choice.torque[-1], speed)
+        gain[table.s > table.s[-1] - reach], margin = gain_at_stop, min(margin, held)
     gain /= (gain * terms.acceleration[:, 3:]).sum(1, keepdims=True)
     if approach is not None and flows:  # it goes on as it comes, and nothing bounds the feedback more than on the way
         press, speed = _push(scene) / float(np.abs(gain).max(1).min()), float(motion.v[-1])
@@ -393,3 +355,25 @@ def _phase_law(
         press=press,
         margin=margin,
     )
+
+
+def _push_at_stop(
+    scene: Scene, k: int, parts: list[Part], torque: Float[np.ndarray, "2"], speed: float
+) -> tuple[float, Float[np.ndarray, "2"], float]:
+    """Choose the push with which phase `k` comes to its stop: its size, its torques, and what it leaves as `margin`.
+
+    It is meant for all parts that come there; where that loses one that has to be held, for these alone.
+    """
+    phase, limit = scene.phases[k], np.asarray(scene.hand.torque_limit)
+    stopped = [part for part in parts if has_paths(part.paths[: k + 1])]
+    every = [object_at_stop(part.scene, phase, part.paths[k]) for part in stopped]
+    held = [stop for stop, part in zip(every, stopped, strict=True) if part.is_held]
+    either = not phase.has_free_finger
+
+    def push_for(stops: list[StopStatics]) -> tuple[float, Float[np.ndarray, "2"], float]:
+        press, gain = choose_push(stops, torque, limit, either_finger=either)
+        pressed = torque + press * gain
+        return press, gain, min(stop.pressed_over(pressed, speed, either_finger=either) for stop in held)
+
+    push = push_for(every)
+    return push if push[2] > 0 or len(held) == len(every) else max(push, push_for(held), key=lambda one: one[2])

@@ -106,3 +106,8 @@ def _terms(dynamics: PathDynamics, segment, parameter):
         return evaluate(dynamics.acceleration, panel, xi), cone_facets(dynamics, evaluate(dynamics.force, panel, xi))
 
     return jax.vmap(at)(segment, parameter)
+
+
+def with_facets(slack: Float[np.ndarray, "nodes facets 5"], count: int) -> Float[np.ndarray, "nodes count 5"]:
+    """Repeat the last facet until there are `count`, as formations of fewer contacts have fewer."""
+    return np.take(slack, np.arange(count), axis=1, mode="clip")

@@ -17,8 +17,7 @@ from wholearm_jax.model import COORDINATES, feature_pair
 from wholearm_jax.planning.moves import move_along
 from wholearm_jax.planning.plans import Plan, Step
 
-FIRST_SHIFT = 0.25  # of a place, in the way along its phase
-HALVINGS = 4
+FIRST_SHIFT, LAST_SHIFT = 1 / 4, 1 / 64  # of a place, in the way along its phase
 LEAST_GAIN = 1e-3  # of the certificate, for which a place moves
 MAX_TRIES = 60  # plans that are traced, at most
 
@@ -35,7 +34,7 @@ def improve_plan(plan: Plan, radius: float, make: Callable[[tuple[Step, ...], fl
         A plan of the same formations in the same order, with a certificate at least as large.
     """
     shift, tries = FIRST_SHIFT, MAX_TRIES
-    while shift >= FIRST_SHIFT / 2**HALVINGS and tries > 0:
+    while shift >= LAST_SHIFT and tries > 0:
         moved = False
         for number, share in itertools.product(range(len(plan.steps) - 1), (shift, -shift)):
             steps = _moved(plan, number, share, radius)
