@@ -72,13 +72,19 @@ def test_stops_of_drawn_parts_lie_within_what_is_said(heptagon):
         assert outside <= 2, (alone, place, table.s[-1])
 
 
-def test_the_push_at_a_stop_has_the_largest_margin_of_all_that_move_every_object(heptagon):
+@pytest.mark.parametrize(
+    ("torque", "bound", "chosen"),
+    [([0.3, -0.2], np.inf, 0.0), ([0.317, -0.139], np.inf, 15.0), ([0.317, -0.139], 0.06, 12.0)],
+)
+def test_the_push_at_a_stop_has_the_largest_margin_of_all_that_move_every_object(heptagon, torque, bound, chosen):
     scene, phase, path = heptagon.scene, heptagon.scene.phases[0], heptagon.phases[0].traced
     stops = [object_at_stop(scene, phase, path)]
     for other in corner_scenes(scene, 0.2, 0.1)[1:4]:
         stops.append(object_at_stop(other, phase, wa.trace(other)[0]))
-    torque, limit = np.array([0.3, -0.2]), np.asarray(scene.hand.torque_limit)
-    push, direction = choose_push(stops, torque, limit, either_finger=True)
+    torque, limit = np.array(torque), np.asarray(scene.hand.torque_limit)
+    push, direction = choose_push(stops, torque, limit, either_finger=True, bound=bound)
+    assert push == chosen
+    assert (np.abs(push * direction) <= bound).all()
 
     def margin(under):
         return min(stop.statics.margin_under(under).margin for stop in stops)
@@ -90,7 +96,7 @@ def test_the_push_at_a_stop_has_the_largest_margin_of_all_that_move_every_object
         for turn in np.linspace(-1.2, 1.2, 7):
             under = torque + size * (ahead + np.tan(turn) * across) / np.hypot(*pull)
             moves = min(stop.acceleration[0] + under @ stop.acceleration[3:] for stop in stops)
-            if moves >= 5.0 and (np.abs(under) <= limit).all():
+            if moves >= 5.0 and (np.abs(under) <= limit).all() and (np.abs(under - torque) <= bound).all():
                 tried += 1
                 assert margin(under) <= found + 1e-9
     assert tried > 10
@@ -133,6 +139,7 @@ def test_parts_that_need_not_be_held_spoil_no_push_at_a_stop(tmp_path):
     controller = feedback(scene, result.torque, friction=0.05)
     assert controller.margin > 0
     (law,) = controller.phases
+    assert (np.abs(law.press * law.gain[-1]) <= controller.push).all()
     under = law.torque[-1] + law.press * law.gain[-1]
     for one in corner_scenes(scene, 0.05, 0.0):
         stop = object_at_stop(one, scene.phases[0], wa.trace(one)[0])

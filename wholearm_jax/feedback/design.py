@@ -371,7 +371,7 @@ def _push_at_stop(
     either = not phase.has_free_finger
 
     def push_for(stops: list[StopStatics]) -> tuple[float, Float[np.ndarray, "2"], float]:
-        press, gain = choose_push(stops, torque, limit, either_finger=either)
+        press, gain = choose_push(stops, torque, limit, either_finger=either, bound=_push(scene))
         pressed = torque + press * gain
         return press, gain, min(stop.pressed_over(pressed, speed, either_finger=either) for stop in held)
 

@@ -113,7 +113,12 @@ class _Push(NamedTuple):
 
 
 def choose_push(
-    stops: list[StopStatics], torque: Float[np.ndarray, "2"], limit: Float[np.ndarray, "2"], *, either_finger: bool
+    stops: list[StopStatics],
+    torque: Float[np.ndarray, "2"],
+    limit: Float[np.ndarray, "2"],
+    *,
+    either_finger: bool,
+    bound: float = np.inf,
 ) -> tuple[float, Float[np.ndarray, "2"]]:
     """Choose the push with which objects arrive at a stop and stand there.
 
@@ -122,23 +127,25 @@ def choose_push(
         torque: The reference's last torque [N m].
         limit: The torque limits [N m].
         either_finger: Whether both fingers may push; else that alone which moves, as the other one is away or holds.
+        bound: Largest torque that the feedback adds [N m].
 
     Returns:
         The acceleration [rad/s^2] that the feedback adds at most, and the torques for one of them [N m s^2]. Of all
-        pushes within the torque limits with which every object is accelerated by `DECISIVE` (less where it is large:
-        `slowness`), and of these where there are any that bring back fingers (`surplus`), it is that with the largest
-        margin at rest (the least of all objects). Where that is negative, pushes that squeeze the object more are
-        tried as well; where none accelerates so much, it is that which accelerates most.
+        pushes within the limits and the bound with which every object is accelerated by `DECISIVE` (less where it is
+        large: `slowness`), and of these where there are any that bring back fingers (`surplus`), it is that with the
+        largest margin at rest (the least of all objects). Where that is negative, pushes that squeeze the object more
+        are tried as well; where none accelerates so much, it is that which accelerates most.
     """
-    push = _push_within(stops, torque, limit, TURNS if either_finger else np.zeros(1), returning=either_finger)
+    limits = np.maximum(torque - bound, -limit), np.minimum(torque + bound, limit)
+    push = _push_within(stops, torque, limits, TURNS if either_finger else np.zeros(1), returning=either_finger)
     if either_finger and push.margin <= 0:  # one that squeezes the object more may hold it
-        steep = _push_within(stops, torque, limit, STEEP_TURNS, returning=True)
+        steep = _push_within(stops, torque, limits, STEEP_TURNS, returning=True)
         push = max(push, steep, key=lambda one: one.margin)
     return push.size, push.direction
 
 
 def _push_within(
-    stops: list[StopStatics], torque, limit, turns: Float[np.ndarray, "turns"], *, returning: bool
+    stops: list[StopStatics], torque, limits, turns: Float[np.ndarray, "turns"], *, returning: bool
 ) -> _Push:
     """Choose the best push of those whose directions have these angles against that which accelerates most.
 
@@ -150,7 +157,7 @@ def _push_within(
     pushes = np.linspace(0.0, LARGEST, TRIED) / stops[0].slowness ** 2
     torques = (torque + pushes[:, None, None] * directions).reshape(-1, 2)
     moves = np.min([stop.acceleration[0] + torques @ stop.acceleration[3:] for stop in stops], axis=0)
-    within = np.all(np.abs(torques) <= limit, axis=1)
+    within = np.all((torques >= limits[0]) & (torques <= limits[1]), axis=1)
     decisive = within & (moves >= stops[0].decisive)
     if returning and (returns := decisive & (stops[0].surplus(torques) > 0).all(1)).any():
         decisive = returns
