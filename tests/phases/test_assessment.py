@@ -84,6 +84,16 @@ def test_at_rest_at_the_end_means_near_and_slow(dynamics, ended, near, slow, arr
     assert np.sqrt(ARRIVAL_SPEED_FACTOR * arrival) == pytest.approx(np.sqrt(2 * 6 * arrival))
 
 
+@pytest.mark.parametrize("slow", [True, False])
+def test_what_brakes_harder_than_a_uniform_motion_may_be_as_fast_as_that_allows(dynamics, slow):
+    """Braking by 200 lengths a duration squared in the last step, of half the duration, it needs 1e-6 of the path."""
+    speed = np.sqrt(2 * 200.0 * DEFAULT_ARRIVAL) * (1 - EDGE if slow else 1 + EDGE)
+    motion = moved(dynamics, S.LEFT_FORMATION, speed=speed)
+    begin = (speed + 200.0 * 0.5) * dynamics.length
+    motion = eqx.tree_at(lambda m: m.w_begin, motion, motion.w_begin.at[-1].set(begin))
+    assert judged(dynamics, motion)[0] is (S.OK if slow else S.LEFT_FORMATION)
+
+
 @pytest.mark.parametrize("goal", [Arrival.MOVING, Arrival.ANY_SPEED])
 @pytest.mark.parametrize("ended", [S.OK, S.LEFT_FORMATION])
 def test_where_any_speed_will_do(dynamics, ended, goal):

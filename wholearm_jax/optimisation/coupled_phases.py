@@ -8,7 +8,7 @@ Derivation: section 9 of `docs/derivation.md`.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -45,6 +45,7 @@ from wholearm_jax.phases import (
     required_accuracy,
     rest_intervals,
     simulate_phase,
+    simulate_with_enough_steps,
 )
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
@@ -259,11 +260,18 @@ def _verify_by_simulation(scene: Scene, group: CoupledPhases, p: Variables) -> t
     return all(is_ok), least if np.isfinite(least) else -np.inf
 
 
-def _simulate_group(group: CoupledPhases, p: Variables, torque: TorqueSchedule) -> list[SimulatedPhase]:
+def _simulate_group(group: CoupledPhases, p: Variables, torque: TorqueSchedule) -> Sequence[SimulatedPhase]:
     """Simulate the phases of a group, from time 0, under a schedule with the durations of `p`."""
+    options = with_step_capacity(IntegratorOptions(), group.options.knots)
+    return simulate_with_enough_steps(functools.partial(_simulate_group_within, group, p, torque), options)
+
+
+def _simulate_group_within(
+    group: CoupledPhases, p: Variables, torque: TorqueSchedule, options: IntegratorOptions
+) -> list[SimulatedPhase]:
+    """Simulate the phases of a group with no more steps than the options have."""
     start, incoming_velocity, simulated_phases = 0.0, None, []
     schedule = pad_schedule(torque, group.options.schedule_rows)
-    options = with_step_capacity(IntegratorOptions(), group.options.knots)
     ends = np.cumsum(np.exp(np.asarray(p.log_duration)) + group.dwell_times)
     for phase, path, end in zip(group.phases, group.traced, ends, strict=True):
         simulated = simulate_phase(

@@ -84,6 +84,7 @@ from wholearm_jax.phases import (
     group_phases,
     idle_torques,
     simulate_phases,
+    simulate_with_enough_steps,
     trace,
 )
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
@@ -256,7 +257,8 @@ def _solve_plan(
     phases = tuple(replace_duration(p, t) for p, t in zip(scene.phases, durations, strict=True))
     scene, torque = eqx.tree_at(lambda s: s.phases, scene, phases), concatenate_schedules(schedules)
     knots = max(options.knots, *(found.knots for found in solutions))
-    simulated = simulate_phases(scene, torque, traced, with_step_capacity(IntegratorOptions(), knots))
+    simulate = partial(simulate_phases, scene, torque, traced)
+    simulated = simulate_with_enough_steps(simulate, with_step_capacity(IntegratorOptions(), knots))
     search = Search(knots, options.rate_limit is not None)
     result = build_result(scene, torque, traced, simulated)
     result = explain(result, margin_bounds=limits.pointwise, search=search, too_short=limits.too_short)

@@ -34,7 +34,12 @@ from wholearm_jax.phases.phase_ends import (
     target_configuration,
 )
 from wholearm_jax.phases.phase_groups import group_phases, starts_at_rest
-from wholearm_jax.phases.phase_simulation import SimulatedPhase, precompile_simulation, simulate_phase
+from wholearm_jax.phases.phase_simulation import (
+    SimulatedPhase,
+    precompile_simulation,
+    simulate_phase,
+    simulate_with_enough_steps,
+)
 from wholearm_jax.phases.phase_tracing import TracedPhase, trace_phase
 from wholearm_jax.phases.plan_schedule import (
     has_torque_jumps,

@@ -17,7 +17,8 @@ DEFAULT_ARRIVAL = 1e-6  # distance from its path's end, in path lengths, within 
 ARRIVAL_SPEED_FACTOR = 12.0
 """Speed allowed at arrival: within a distance `a` of the end, in path lengths, it is at most `sqrt(12 a)` path lengths
 per duration, from which braking at 6 lengths per duration squared (the uniform rest-to-rest motion) stops within `a`.
-Nearer to the end, time and position do not fix the speed better than this square root."""
+Nearer to the end, time and position do not fix the speed better than this square root. A motion that brakes harder than
+so in its last step may be as fast as its own braking allows."""
 
 
 class Assessment(NamedTuple):
@@ -53,7 +54,7 @@ def assess_phase(
         impact: Impact at which the phase is entered.
         opening: How far a contact opens then.
         arrival: Distance from the path's end within which the phase must end, in path lengths.
-        is_slow: Whether the motion ends slowly enough for a rest (None: by `ARRIVAL_SPEED_FACTOR`).
+        is_slow: Whether the motion ends slowly enough for a rest (None: by `ARRIVAL_SPEED_FACTOR` and its braking).
     """
     holds = goal == Arrival.HOLD
     contact_lost, end_time = int(Status.CONTACT_LOST), motion.phase_time[motion.count]
@@ -77,10 +78,10 @@ def assess_phase(
 
 def _assess_arrival(dynamics: PathDynamics, motion: Motion, at_rest, arrival, is_slow) -> Int[Array, ""]:
     """Decide the status of a phase that moves the object to its path's end, `at_rest` or at any speed."""
-    phase_time, s, w = (values[motion.count] for values in (motion.phase_time, motion.s, motion.w))
+    phase_time, s = motion.phase_time[motion.count], motion.s[motion.count]
     max_speed = jnp.sqrt(ARRIVAL_SPEED_FACTOR * jnp.asarray(arrival, s.dtype))
     is_near = jnp.abs(dynamics.breakpoints[-1] - s) <= arrival * dynamics.length
-    is_slow = w <= max_speed * dynamics.length if is_slow is None else is_slow
+    is_slow = _stops_within(motion, arrival * dynamics.length, dynamics.length) if is_slow is None else is_slow
     is_late = phase_time >= 1 - max_speed
     ended = motion.status
     reached = (ended == Status.LEFT_FORMATION) | (ended == Status.OK)
@@ -89,6 +90,16 @@ def _assess_arrival(dynamics: PathDynamics, motion: Motion, at_rest, arrival, is
     failure = jnp.where(ended == Status.OK, int(Status.NOT_REACHED), ended)
     arrival_status = jnp.where(dynamics.ends_at_obstacle, int(Status.OBSTACLE), int(Status.OK))
     return jnp.where(arrived, arrival_status, failure)
+
+
+def _stops_within(motion: Motion, distance, length) -> Bool[Array, ""]:
+    """Say whether a motion would stop within a distance, braking as in its last step, or as a uniform motion does."""
+    last = jnp.maximum(motion.count - 1, 0)
+    time = motion.phase_time[motion.count] - motion.phase_time[last]
+    w = motion.w[motion.count]
+    own = (motion.w_begin[last] - w) / jnp.where(time > 0, time, jnp.inf)
+    braking = jnp.maximum(own, ARRIVAL_SPEED_FACTOR / 2 * length)
+    return w <= jnp.sqrt(2 * braking * distance)
 
 
 def _assess_hold(motion: Motion) -> tuple[Int[Array, ""], Float[Array, ""]]:

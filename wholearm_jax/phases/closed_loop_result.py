@@ -1,5 +1,8 @@
 """The simulation of a plan in closed loop as a `Result`, with the torques that the law has exerted as its schedule."""
 
+from collections.abc import Sequence
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,14 +10,12 @@ import numpy as np
 from wholearm_jax.core import Status, as_device_array, on_host, require_positive, require_x64
 from wholearm_jax.model import LawTables, Scene, TorqueSchedule, uniform_schedule
 from wholearm_jax.phases.closed_loop import CLOSED_LOOP_ARRIVAL, CLOSED_LOOP_STEPS, simulate_closed_loop
-from wholearm_jax.phases.phase_simulation import SimulatedPhase
+from wholearm_jax.phases.phase_simulation import SimulatedPhase, simulate_with_enough_steps
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.phases.plan_schedule import require_motion
 from wholearm_jax.phases.plan_tracing import trace
 from wholearm_jax.phases.result import Result, build_result
 from wholearm_jax.simulation import IntegratorOptions, Motion, PhaseLoop, phase_loop, torques_of_step
-
-MAX_CLOSED_LOOP_STEPS = 16384  # a phase, beyond which nothing is tried again
 
 
 @on_host("wholearm_jax.phases.closed_loop_margin is the margin as a number that can be transformed")
@@ -45,17 +46,15 @@ def closed_loop_result(
     require_x64(scene, law)
     require_positive(tolerance=tolerance, arrival=arrival)
     require_motion(scene)
-    traced, steps = traced or trace(scene), CLOSED_LOOP_STEPS
-    while True:
-        options = IntegratorOptions(tolerance=tolerance, max_steps=steps, max_stages=steps // 64)
-        phases = simulate_closed_loop(scene, law, traced, options, arrival)
-        used_up = any(int(one.assessment.status) == Status.MAX_STEPS for one in phases)
-        if not used_up or steps >= MAX_CLOSED_LOOP_STEPS:
-            return build_result(scene, _exerted(law, traced, phases), traced, phases)
-        steps *= 4
+    traced = traced or trace(scene)
+    steps = CLOSED_LOOP_STEPS
+    options = IntegratorOptions(tolerance=tolerance, max_steps=steps, max_stages=steps // 64)
+    simulated = partial(simulate_closed_loop, scene, law, traced, arrival=arrival)
+    phases = simulate_with_enough_steps(simulated, options)
+    return build_result(scene, _exerted(law, traced, phases), traced, phases)
 
 
-def _exerted(law: LawTables, traced: tuple[TracedPhase, ...], phases: tuple[SimulatedPhase, ...]) -> TorqueSchedule:
+def _exerted(law: LawTables, traced: tuple[TracedPhase, ...], phases: Sequence[SimulatedPhase]) -> TorqueSchedule:
     """Return the torques of the law where the steps of a motion begin and end."""
     times, torques = [], []
     for k, (path, one) in enumerate(zip(traced, phases, strict=True)):

@@ -3,6 +3,8 @@
 One compiled program (`_simulate_phase`) serves every phase of every scene.
 """
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,6 +21,8 @@ from wholearm_jax.phases.contact_opening import ContactOpening, contact_opening
 from wholearm_jax.phases.phase_tracing import MIN_LENGTH
 from wholearm_jax.simulation import Actuation, IntegratorOptions, Motion, simulate_motion, tolerance_as_data
 from wholearm_jax.tracing import Resolution
+
+MAX_SIMULATION_STEPS = 16384  # a phase, beyond which nothing is tried again
 
 
 class SimulatedPhase(NamedTuple):
@@ -120,6 +124,21 @@ def simulate_under(
     panel, xi = locate_panel(dynamics, motion.segment[last], motion.s[motion.count])
     exit_velocity = evaluate(dynamics.velocity, panel, xi) * motion.w[motion.count] / duration
     return SimulatedPhase(start, duration, impact, opening, motion, margin_result, assessment, exit_velocity)
+
+
+def simulate_with_enough_steps(
+    simulated: Callable[[IntegratorOptions], Sequence[SimulatedPhase]], options: IntegratorOptions
+) -> Sequence[SimulatedPhase]:
+    """Simulate phases with four times as many steps, again and again, where those of the options do not suffice.
+
+    They are few for most motions; joints of much viscous friction, or torques that change fast, need more.
+    """
+    while True:
+        phases = simulated(options)
+        used_up = any(int(phase.assessment.status) == Status.MAX_STEPS for phase in phases)
+        if not used_up or options.max_steps >= MAX_SIMULATION_STEPS:
+            return phases
+        options = replace(options, max_steps=4 * options.max_steps, max_stages=4 * options.max_stages)
 
 
 def precompile_simulation(rows: int, options: IntegratorOptions) -> None:

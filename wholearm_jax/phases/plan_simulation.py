@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.core import (
     BackgroundTask,
-    Status,
     as_device_array,
     compile_in_background,
     is_traced,
@@ -28,14 +27,17 @@ from wholearm_jax.core import (
 )
 from wholearm_jax.model import Arrival, Phase, Scene, TorqueSchedule, pad_schedule, round_up
 from wholearm_jax.phases.assessment import DEFAULT_ARRIVAL
-from wholearm_jax.phases.phase_simulation import SimulatedPhase, precompile_simulation, simulate_phase
+from wholearm_jax.phases.phase_simulation import (
+    SimulatedPhase,
+    precompile_simulation,
+    simulate_phase,
+    simulate_with_enough_steps,
+)
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.phases.plan_schedule import has_torque_jumps, require_covered, with_plan_step_capacity
 from wholearm_jax.phases.plan_tracing import trace
 from wholearm_jax.phases.result import Result, build_result
 from wholearm_jax.simulation import IntegratorOptions, tolerance_as_data
-
-MAX_SIMULATION_STEPS = 16384  # a phase, beyond which `simulate` does not try again
 
 
 @on_host("wholearm_jax.margin is the margin as a number that can be transformed")
@@ -82,13 +84,9 @@ def simulate(
         compiled = precompile_simulate(scene, torque, tolerance, max_steps)
         traced = trace(scene)
         wait_for(compiled)
-    while True:
-        options = _integrator_options(scene, torque, tolerance, max_steps)
-        phases = simulate_phases(scene, torque, traced, options, arrival)
-        used_up = any(int(p.assessment.status) == Status.MAX_STEPS for p in phases)
-        if not used_up or max_steps >= MAX_SIMULATION_STEPS:
-            return build_result(scene, torque, traced, phases)
-        max_steps *= 4
+    options = _integrator_options(scene, torque, tolerance, max_steps)
+    simulated = partial(simulate_phases, scene, torque, traced, arrival=arrival)
+    return build_result(scene, torque, traced, simulate_with_enough_steps(simulated, options))
 
 
 def precompile_simulate(
