@@ -10,6 +10,7 @@ import wholearm_jax as wa
 from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.model.scene import replace_duration
 from wholearm_jax.phases.compressive_margin import plan_margin
+from wholearm_jax.phases.phase_simulation import simulate_with_enough_steps
 from wholearm_jax.phases.plan_schedule import has_torque_jumps, with_plan_step_capacity
 from wholearm_jax.phases.plan_simulation import simulate_phases
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
@@ -46,6 +47,19 @@ def test_a_part_of_a_motion_has_no_margin(heptagon):
     short = simulate_phases(scene, torque, wa.trace(scene), IntegratorOptions(max_steps=16))
     assert wa.Status(int(short[0].assessment.status)) is wa.Status.MAX_STEPS
     assert float(plan_margin(scene, short)) == -np.inf
+
+
+def test_a_motion_gets_the_steps_that_it_needs(heptagon):
+    scene, torque = heptagon
+    asked = []
+
+    def simulated(options):
+        asked.append((options.max_steps, options.max_stages))
+        return simulate_phases(scene, torque, wa.trace(scene), options)
+
+    enough = simulate_with_enough_steps(simulated, IntegratorOptions(max_steps=16, max_stages=2))
+    assert asked == [(16, 2), (64, 8), (256, 32)]
+    assert float(plan_margin(scene, enough)) == pytest.approx(float(wa.margin(scene, torque)), rel=1e-9)
 
 
 @pytest.mark.parametrize("rows", [51, 271, 2001])

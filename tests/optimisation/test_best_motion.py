@@ -111,3 +111,16 @@ def test_certificate_and_shortest_time_are_differentiable_in_every_float_of_a_sc
     for fast, tolerance in ((False, 1e-5), (True, 3e-5)):
         difference = (value(flat + 1e-5 * direction, fast) - value(flat - 1e-5 * direction, fast)) / 2e-5
         assert float(slope(fast)) == pytest.approx(float(difference), rel=tolerance)
+
+
+def test_without_weight_and_friction_of_joints_forces_scale_with_torques():
+    """All torques times four move the object the same way in half the time, with four times the forces."""
+    scene = wa.load("passage")
+    none, hand = jnp.zeros(2), scene.hand
+    scene = eqx.tree_at(lambda s: (s.gravity, s.hand.dry, s.hand.viscous), scene, (none, none, none))
+    strong = eqx.tree_at(lambda s: s.hand.torque_limit, scene, 4 * hand.torque_limit)
+    strong = eqx.tree_at(lambda s: [p.duration for p in s.phases], strong, [p.duration / 2 for p in scene.phases])
+    for weak, four in zip(wa.convex_bounds(scene), wa.convex_bounds(strong), strict=True):
+        assert weak.feasible
+        assert weak.margin > 0
+        assert four.margin == pytest.approx(4 * weak.margin, rel=1e-6)

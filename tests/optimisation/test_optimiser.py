@@ -264,12 +264,11 @@ def test_a_phase_that_brakes_to_the_last_ends_on_time():
         assert phase.time == pytest.approx(end, abs=1e-5)
 
 
-def test_joints_of_much_viscous_friction_are_given_the_steps_that_they_need():
-    """Their time constants are a millisecond: 256 steps of the integrator lead through half of the phase."""
+def test_joints_of_much_viscous_friction_get_the_steps_that_they_need():
+    """Their time constants are a millisecond: a hundred steps of the interior point do not lead to the best motion."""
     scene = wa.load("box")
     stiff = jnp.full(2, 1.0), jnp.zeros(2), jnp.full(2, 5.0), scene.phases[:1]
     scene = eqx.tree_at(lambda s: (s.hand.viscous, s.hand.dry, s.hand.torque_limit, s.phases), scene, stiff)
     found = wa.optimise(scene)
     assert found.result.status is wa.Status.OK, found.result.message
-    assert int(found.result.phases[0].outcome.motion.count) > 256
-    assert found.result.margin > 0.9
+    assert 0.99 < found.bound_fraction[0] <= 1

@@ -42,7 +42,7 @@ from wholearm_jax.margin.chain_constraints import (
 )
 from wholearm_jax.margin.path_programme import PathProgramme
 
-MAX_CHAIN_ITERATIONS = 100
+MAX_CHAIN_ITERATIONS = 100  # unless more are allowed
 GAP_TOLERANCE = 1e-9  # sum of slacks times multipliers, in force units (or units of time)
 RESIDUAL_TOLERANCE = 1e-8
 RESIDUAL_FRACTION = 1e-4  # the barrier parameter stays above this times the residual: feasibility first
@@ -110,12 +110,15 @@ class _NewtonSystem(NamedTuple):
     solved_time: Float[Array, "nodes"]
 
 
-def solve_chain(programme: PathProgramme, margin: float | Float[Array, ""]) -> ChainSolution:
+def solve_chain(
+    programme: PathProgramme, margin: float | Float[Array, ""], iterations: int | Int[Array, ""] = MAX_CHAIN_ITERATIONS
+) -> ChainSolution:
     """Solve a path programme for the largest margin, or for the shortest time with a margin.
 
     Args:
         programme: Discretised problem, with any time where a margin is given.
         margin: Margin, in force units, to be kept in the shortest time; NaN for the largest margin.
+        iterations: Largest number of iterations.
     """
     p, margin = stop_gradient((programme, margin))
     fast = ~jnp.isnan(margin)
@@ -128,7 +131,7 @@ def solve_chain(programme: PathProgramme, margin: float | Float[Array, ""]) -> C
 
     def going(at: _Iterate):
         fine = (at.gap <= GAP_TOLERANCE) & (at.residual <= RESIDUAL_TOLERANCE)
-        return (at.count < MAX_CHAIN_ITERATIONS) & ~fine & jnp.isfinite(at.gap)
+        return (at.count < iterations) & ~fine & jnp.isfinite(at.gap)
 
     far = jnp.asarray(1e30, x.b.dtype)
     first = _Iterate(x, slack, multiplier, far, far, jnp.asarray(0))

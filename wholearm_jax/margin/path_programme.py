@@ -23,6 +23,7 @@ from wholearm_jax.margin.contact_forces import MAX_ROLLING, cone_facets
 
 GRADING = 0.5  # 0: nodes evenly spaced in each segment; 1: at Chebyshev's places, dense at its ends
 MIN_INTERVALS = 2  # of a segment
+LEAST_UNIT = 1e-3  # of force, over the largest that torques at their limits exert
 SPEED_CAP = 100.0  # largest b in units of path length times largest acceleration, where nothing else limits it
 
 
@@ -99,12 +100,14 @@ def discretise(
     viscous = _viscous_torque(acceleration, force)
     facets = jax.vmap(partial(cone_facets, dynamics, rolling=rolling))(force)
 
-    # Units: of length the path's, of time that of the largest acceleration, of force the largest without torque.
+    # Units: of length the path's, of time that of the largest acceleration, of force the largest without torque, or
+    # a share of that with torques at their limits where there is hardly any without.
     limit, scale = dynamics.torque_limit, grid.scale
     length = stop_gradient(grid.width.sum())
     push = (jnp.abs(acceleration[:, 0]) + jnp.abs(acceleration[:, 3:]) @ limit) / scale
     time_unit = stop_gradient(jnp.sqrt(length / jnp.where(grid.is_live, push, 0.0).max()))
-    force_unit = stop_gradient(jnp.where(grid.is_live, jnp.abs(facets[:, :, 0]).max(1), 0.0).max())
+    pressed = jnp.maximum(jnp.abs(facets[:, :, 0]), LEAST_UNIT * jnp.abs(facets[:, :, 3:]) @ limit)
+    force_unit = stop_gradient(jnp.where(grid.is_live, pressed.max(1), 0.0).max())
     speed_unit = scale * length / time_unit
     one = jnp.ones_like(scale)
     of_terms = jnp.stack([one, speed_unit**2, limit[0] * one, limit[1] * one])

@@ -11,10 +11,12 @@ from jaxtyping import Array, Float
 
 from wholearm_jax.core import LOOPS_AS_KERNELS, CachedJit, Status, as_device_array, require_x64
 from wholearm_jax.dynamics import PathDynamics
-from wholearm_jax.margin import PROGRAMME_INTERVALS, PathOptimum, SpeedRange, solve_path
+from wholearm_jax.margin import MAX_CHAIN_ITERATIONS, PROGRAMME_INTERVALS, PathOptimum, SpeedRange, solve_path
 from wholearm_jax.model import Arrival, Phase, Scene
 from wholearm_jax.optimisation.quasistatic_plan import rolling_count
 from wholearm_jax.phases import TracedPhase, starts_at_rest, trace
+
+MORE_ITERATIONS = 4 * MAX_CHAIN_ITERATIONS
 
 
 @dataclass(frozen=True)
@@ -117,14 +119,20 @@ def largest_margin(
     intervals: int = PROGRAMME_INTERVALS,
 ) -> PathOptimum:
     """Return the motion with the largest margin in a duration; see `solve_path`."""
-    return _solve_path(dynamics, duration, as_device_array(np.nan), speeds, intervals, rolling)
+    return _solve(dynamics, duration, as_device_array(np.nan), speeds, intervals, rolling)
 
 
 def shortest_duration(
     dynamics: PathDynamics, margin: Float[Array, ""], speeds: SpeedRange, rolling: int
 ) -> PathOptimum:
     """Return the fastest motion with a margin; see `solve_path`."""
-    return _solve_path(dynamics, as_device_array(np.inf), margin, speeds, PROGRAMME_INTERVALS, rolling)
+    return _solve(dynamics, as_device_array(np.inf), margin, speeds, PROGRAMME_INTERVALS, rolling)
+
+
+def _solve(*problem) -> PathOptimum:
+    """Solve a path's programme, with more iterations where the usual number does not suffice."""
+    found = _solve_path(*problem, as_device_array(MAX_CHAIN_ITERATIONS))
+    return found if found.converged else _solve_path(*problem, as_device_array(MORE_ITERATIONS))
 
 
 def _each_phase(scene: Scene, traced, solve) -> tuple[BestMotion | None, ...]:
