@@ -10,7 +10,7 @@ import wholearm_jax as wa
 from wholearm_jax.dynamics import Impact
 from wholearm_jax.margin import MarginResult
 from wholearm_jax.model import Arrival
-from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, DEFAULT_ARRIVAL, assess_phase
+from wholearm_jax.phases.assessment import ARRIVAL_SPEED_FACTOR, BRAKING_SPEED, DEFAULT_ARRIVAL, assess_phase
 from wholearm_jax.phases.contact_opening import MAX_OPENING, ContactOpening
 from wholearm_jax.simulation import Motion
 
@@ -91,6 +91,15 @@ def test_what_brakes_harder_than_a_uniform_motion_may_be_as_fast_as_that_allows(
     motion = moved(dynamics, S.LEFT_FORMATION, speed=speed)
     begin = (speed + 200.0 * 0.5) * dynamics.length
     motion = eqx.tree_at(lambda m: m.w_begin, motion, motion.w_begin.at[-1].set(begin))
+    assert judged(dynamics, motion)[0] is (S.OK if slow else S.LEFT_FORMATION)
+
+
+@pytest.mark.parametrize("slow", [True, False])
+def test_what_brakes_however_hard_is_no_faster_than_a_tenth_of_the_mean_speed(dynamics, slow):
+    speed = BRAKING_SPEED * (1 - EDGE if slow else 1 + EDGE)
+    motion = moved(dynamics, S.LEFT_FORMATION, speed=speed)
+    motion = eqx.tree_at(lambda m: m.w_begin, motion, motion.w_begin.at[-1].set(1e5 * dynamics.length))
+    assert BRAKING_SPEED == 0.1
     assert judged(dynamics, motion)[0] is (S.OK if slow else S.LEFT_FORMATION)
 
 

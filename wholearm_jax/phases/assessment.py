@@ -18,7 +18,8 @@ ARRIVAL_SPEED_FACTOR = 12.0
 """Speed allowed at arrival: within a distance `a` of the end, in path lengths, it is at most `sqrt(12 a)` path lengths
 per duration, from which braking at 6 lengths per duration squared (the uniform rest-to-rest motion) stops within `a`.
 Nearer to the end, time and position do not fix the speed better than this square root. A motion that brakes harder than
-so in its last step may be as fast as its own braking allows."""
+so in its last step may be as fast as its own braking allows, up to `BRAKING_SPEED`."""
+BRAKING_SPEED = 0.1  # path lengths per duration
 
 
 class Assessment(NamedTuple):
@@ -98,8 +99,10 @@ def _stops_within(motion: Motion, distance, length) -> Bool[Array, ""]:
     time = motion.phase_time[motion.count] - motion.phase_time[last]
     w = motion.w[motion.count]
     own = (motion.w_begin[last] - w) / jnp.where(time > 0, time, jnp.inf)
-    braking = jnp.maximum(own, ARRIVAL_SPEED_FACTOR / 2 * length)
-    return w <= jnp.sqrt(2 * braking * distance)
+    uniform = jnp.sqrt(ARRIVAL_SPEED_FACTOR * length * distance)
+    return w <= jnp.maximum(
+        uniform, jnp.minimum(jnp.sqrt(2 * jnp.maximum(own, 0.0) * distance), BRAKING_SPEED * length)
+    )
 
 
 def _assess_hold(motion: Motion) -> tuple[Int[Array, ""], Float[Array, ""]]:
