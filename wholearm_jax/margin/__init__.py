@@ -1,7 +1,7 @@
 """Contact forces, their exact minimum over time, quasi-static torques, upper bounds, statics of rest."""
 
 from wholearm_jax.margin.barrier_minimum import log_barrier_minimum
-from wholearm_jax.margin.chain_interior_point import MAX_CHAIN_ITERATIONS
+from wholearm_jax.margin.chain_interior_point import ChainEffort
 from wholearm_jax.margin.contact_forces import (
     MAX_ROLLING,
     SAMPLES_PER_STEP,

@@ -42,12 +42,17 @@ from wholearm_jax.margin.chain_constraints import (
 )
 from wholearm_jax.margin.path_programme import PathProgramme
 
-MAX_CHAIN_ITERATIONS = 100  # unless more are allowed
 GAP_TOLERANCE = 1e-9  # sum of slacks times multipliers, in force units (or units of time)
 RESIDUAL_TOLERANCE = 1e-8
 RESIDUAL_FRACTION = 1e-4  # the barrier parameter stays above this times the residual: feasibility first
-TO_BOUNDARY = 0.99  # fraction of the step to the nearest bound
 FIRST_SLACK = 0.1  # least slack to begin with
+
+
+class ChainEffort(NamedTuple):
+    """How many iterations are allowed, and how long their steps may be: joints of much viscous friction need many."""
+
+    iterations: int | Int[Array, ""] = 100
+    to_boundary: float | Float[Array, ""] = 0.99  # fraction of the step to the nearest bound
 
 
 class ChainSolution(eqx.Module):
@@ -111,14 +116,14 @@ class _NewtonSystem(NamedTuple):
 
 
 def solve_chain(
-    programme: PathProgramme, margin: float | Float[Array, ""], iterations: int | Int[Array, ""] = MAX_CHAIN_ITERATIONS
+    programme: PathProgramme, margin: float | Float[Array, ""], effort: ChainEffort = ChainEffort()
 ) -> ChainSolution:
     """Solve a path programme for the largest margin, or for the shortest time with a margin.
 
     Args:
         programme: Discretised problem, with any time where a margin is given.
         margin: Margin, in force units, to be kept in the shortest time; NaN for the largest margin.
-        iterations: Largest number of iterations.
+        effort: How many iterations, and how long steps.
     """
     p, margin = stop_gradient((programme, margin))
     fast = ~jnp.isnan(margin)
@@ -131,11 +136,11 @@ def solve_chain(
 
     def going(at: _Iterate):
         fine = (at.gap <= GAP_TOLERANCE) & (at.residual <= RESIDUAL_TOLERANCE)
-        return (at.count < iterations) & ~fine & jnp.isfinite(at.gap)
+        return (at.count < effort.iterations) & ~fine & jnp.isfinite(at.gap)
 
     far = jnp.asarray(1e30, x.b.dtype)
     first = _Iterate(x, slack, multiplier, far, far, jnp.asarray(0))
-    at = jax.lax.while_loop(going, lambda at: _iterate(p, at, fast), first)
+    at = jax.lax.while_loop(going, lambda at: _iterate(p, at, fast, effort.to_boundary), first)
     b, a = point_values(p, at.x)
     torque = motor_torque(p, b, point_torque(p, b, a, at.x.u))
     fine = (at.gap <= 1e3 * GAP_TOLERANCE) & (at.residual <= 10 * RESIDUAL_TOLERANCE)
@@ -172,7 +177,7 @@ def _first_guess(p: PathProgramme, margin) -> ChainUnknowns:
     return x._replace(m=jnp.where(jnp.isnan(margin), below, margin))
 
 
-def _iterate(p: PathProgramme, at: _Iterate, fast) -> _Iterate:
+def _iterate(p: PathProgramme, at: _Iterate, fast, to_boundary) -> _Iterate:
     """Predict without a barrier, choose the barrier parameter by how far that step goes, correct, and step."""
     system = _assemble(p, at, fast)
     live, slack, multiplier = system.live, at.slack, at.multiplier
@@ -192,8 +197,8 @@ def _iterate(p: PathProgramme, at: _Iterate, fast) -> _Iterate:
 
     none = jax.tree.map(jnp.zeros_like, (at.x, slack, slack, barrier))
     dx, ds, dz, _ = jax.lax.fori_loop(0, 2, improve, none)
-    primal = jnp.minimum(1.0, TO_BOUNDARY * _feasible_fraction(slack, ds))
-    dual = jnp.minimum(1.0, TO_BOUNDARY * _feasible_fraction(multiplier, dz))
+    primal = jnp.minimum(1.0, to_boundary * _feasible_fraction(slack, ds))
+    dual = jnp.minimum(1.0, to_boundary * _feasible_fraction(multiplier, dz))
     nonlinear, both = system.timed | fast, jnp.minimum(primal, dual)
     primal, dual = jnp.where(nonlinear, both, primal), jnp.where(nonlinear, both, dual)
     x, slack, multiplier = _moved(at.x, dx, primal), _moved(slack, ds, primal), _moved(multiplier, dz, dual)

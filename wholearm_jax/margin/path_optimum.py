@@ -10,7 +10,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.dynamics import PathDynamics, evaluate_dot, locate_panel
-from wholearm_jax.margin.chain_interior_point import MAX_CHAIN_ITERATIONS, ChainSolution, lagrangian, solve_chain
+from wholearm_jax.margin.chain_interior_point import ChainEffort, ChainSolution, lagrangian, solve_chain
 from wholearm_jax.margin.contact_forces import MAX_ROLLING
 from wholearm_jax.margin.path_programme import PathProgramme, SpeedRange, discretise
 
@@ -51,7 +51,7 @@ def solve_path(
     speeds: SpeedRange,
     intervals: int = PROGRAMME_INTERVALS,
     rolling: int = MAX_ROLLING,
-    iterations: int | Int[Array, ""] = MAX_CHAIN_ITERATIONS,
+    effort: ChainEffort = ChainEffort(),
 ) -> PathOptimum:
     """Return the motion with the largest margin under any torque within limits, or the fastest with a given one.
 
@@ -63,14 +63,14 @@ def solve_path(
         speeds: speeds allowed at the ends and on the way.
         intervals: number of intervals; the error falls with its square.
         rolling: largest number of rolling contacts that the formation may have.
-        iterations: of the interior point, at most; joints of much viscous friction need more than others.
+        effort: of the interior point.
 
     Returns:
         The optimum; not `converged` where no motion takes so little time, or has such a margin.
     """
     programme = discretise(dynamics, duration, speeds, intervals, rolling)
     kept = margin / programme.force_unit
-    solution = solve_chain(programme, kept, iterations)
+    solution = solve_chain(programme, kept, effort)
     value = lagrangian(programme, solution, kept)
     fast = ~jnp.isnan(margin)
     best_margin = jnp.where(fast, margin, value * programme.force_unit)

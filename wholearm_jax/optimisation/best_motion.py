@@ -6,17 +6,18 @@ Derivation: section 8 of `docs/derivation.md`.
 
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 from wholearm_jax.core import LOOPS_AS_KERNELS, CachedJit, Status, as_device_array, require_x64
 from wholearm_jax.dynamics import PathDynamics
-from wholearm_jax.margin import MAX_CHAIN_ITERATIONS, PROGRAMME_INTERVALS, PathOptimum, SpeedRange, solve_path
+from wholearm_jax.margin import PROGRAMME_INTERVALS, ChainEffort, PathOptimum, SpeedRange, solve_path
 from wholearm_jax.model import Arrival, Phase, Scene
 from wholearm_jax.optimisation.quasistatic_plan import rolling_count
 from wholearm_jax.phases import TracedPhase, starts_at_rest, trace
 
-MORE_ITERATIONS = 4 * MAX_CHAIN_ITERATIONS
+MORE_EFFORT = ChainEffort(iterations=600, to_boundary=0.9)
 
 
 @dataclass(frozen=True)
@@ -130,9 +131,10 @@ def shortest_duration(
 
 
 def _solve(*problem) -> PathOptimum:
-    """Solve a path's programme, with more iterations where the usual number does not suffice."""
-    found = _solve_path(*problem, as_device_array(MAX_CHAIN_ITERATIONS))
-    return found if found.converged else _solve_path(*problem, as_device_array(MORE_ITERATIONS))
+    """Solve a path's programme, with more effort where the usual one does not suffice."""
+    usual, more = (jax.tree.map(as_device_array, effort) for effort in (ChainEffort(), MORE_EFFORT))
+    found = _solve_path(*problem, usual)
+    return found if found.converged else _solve_path(*problem, more)
 
 
 def _each_phase(scene: Scene, traced, solve) -> tuple[BestMotion | None, ...]:
