@@ -137,6 +137,22 @@ def test_a_place_moved_beyond_its_path_is_no_plan(part, shifted_and_turned):
     assert beyond is None or not is_secure(beyond, regrasps=False)
 
 
+def test_a_way_back_leads_on_where_the_first_was_too_short_to_be_one():
+    """0.3 mm to the left of the start finger 2's tip meets a vertex: too short a slide for a hand."""
+    data = part_data()
+    outline = [[40.1, 2.1], [31.2, 21.7], [-14.2, 38.1], [-41.3, 17.7], [-32.7, -25.1], [-8.7, -42.1], [28.7, -24.2]]
+    data["object"] = {"vertices": (np.array(outline) / 1e3).tolist(), "mass": 0.25, "friction": 0.09}
+    for finger in ("finger1", "finger2"):
+        data["hand"][finger]["length"] = 0.11
+    scene = wa.parse(data)
+    start = jnp.asarray(resting_configuration(scene.object, scene.hand, 1, 0.01))
+    scene = eqx.tree_at(lambda s: (s.start, s.phases), scene, (start, ()))
+    found = wa.plan(scene, by={"x": -0.005}, count=1, max_nodes=15)
+    assert found.found, found.reason
+    assert [step.toward for step in found.plans[0].steps] == ["x+", "x-", "x-"]
+    assert found.plans[0].ends[-1][0] - found.start[0] == pytest.approx(-0.005, abs=1e-6)
+
+
 @pytest.mark.slow
 def test_the_best_plan_can_be_optimised_as_it_is(turned):
     optimum = wa.optimise(turned.plans[0].scene, knots=21)

@@ -36,7 +36,7 @@ from wholearm_jax.model import (
 from wholearm_jax.phases import describe_overlaps, possible_hand_overs, trace
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.improvement import improve_plan, is_secure
-from wholearm_jax.planning.moves import Move, moves_from
+from wholearm_jax.planning.moves import SHORTEST_MOVE, Move, moves_from
 from wholearm_jax.planning.obstructions import explain_failure, explain_far_goal
 from wholearm_jax.planning.plans import (
     Edge,
@@ -56,6 +56,7 @@ STOPS = {  # fractions of a path at which other moves may begin, and by how many
     **dict.fromkeys((1 / 12, 1 / 4, 5 / 12, 7 / 12, 3 / 4, 11 / 12), 2.0),
 }
 AT_TIP = 3.0  # by how many phases later an arrival is taken at which a contact leaves its feature, as at a tip
+BEYOND_BEGIN = 1e-3  # how far beyond a step's begin the way back leads on, at least [object radii, rad]
 MERGE_TOL = 1e-5  # configurations closer than this, in object radii and radians, are one node
 TYPICAL_SHIFT, TYPICAL_TURN = 0.5, 0.5  # of one move [object radii, rad], for the estimate of phases to come
 SHORT_PLAN = 5  # phases
@@ -317,10 +318,8 @@ def _expand(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching) -
     moves = moves_from(search.scene, here, touching, left=left, rolling=search.rolling, regrasps=regrasps)
     search.nodes += 1
     search.moves += len(moves)
-    previous = steps[-1].contacts if steps else None
     alone, others = separate_regrasps(moves) if regrasps else ((), moves)
-    # On or back along the same path is no new move.
-    stops = [(move, stop) for move in others if move.contacts != previous for stop in _stops(search, move)]
+    stops = [(move, stop) for move in others if _leads_on(search, steps, move) for stop in _stops(search, move)]
     last = steps[-1].regrasp if steps else None
     survives = _hand_over_check(search, steps)
     capacity = search.scene.object.vertices.shape[0]
@@ -331,6 +330,18 @@ def _expand(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching) -
             # Along the path of a finger alone, more may touch than what holds the object.
             seen = None if is_end or step.regrasp else _names(move)
             _push(search, step.end, (*steps, step), seen)
+
+
+def _leads_on(search: _Search, steps: tuple[Step, ...], move: Move) -> bool:
+    """Say whether a move is a new one: not on along the last step's path, nor back to where that began.
+
+    A little beyond there, where a move from there would have been too short, it is one: it ends at another contact.
+    """
+    if not steps or move.contacts != steps[-1].contacts:
+        return True
+    begin = steps[-2].end if len(steps) > 1 else search.start
+    beyond = np.abs(move.places[-1] - begin) / np.array([search.radius, search.radius, 1, 1, 1])
+    return bool(BEYOND_BEGIN < beyond.max() <= SHORTEST_MOVE)
 
 
 def _hand_over_check(search: _Search, steps: tuple[Step, ...]) -> Callable[[Move, Step], bool]:
