@@ -135,11 +135,11 @@ def search_all(kind: str, hand: str, scene: wa.Scene, options: argparse.Namespac
     goals = {name: make_goal(start, by=by) for name, by in GOALS.items()}
     begun = time.perf_counter()
     reached = explore(scene, goals, options.depth, options.places, options.cells)
-    found = {"exhaustive_seconds": time.perf_counter() - begun, "exhaustive_paths": reached.paths}
+    cost = {"exhaustive_seconds": time.perf_counter() - begun, "exhaustive_paths": reached.paths}
     rows = []
     for name, goal in goals.items():
         reference = best_plan(scene, reached.ways[name], goal)
-        row = {"kind": kind, "hand": hand, "goal": name, "exhaustive": reference and reference.bound, **found}
+        row = {"kind": kind, "hand": hand, "goal": name, "exhaustive": reference and reference.bound, **cost}
         if reference is not None:
             row["best_ways"] = [(step.contacts, step.toward) for step in reference.steps]
         rows.append(row)
@@ -216,9 +216,9 @@ def main() -> None:
             scene = at_rest(shape, *HANDS[hand])
             if scene is None:
                 continue
-            found = known[len(rows) :][: len(GOALS)] if options.again else search_all(kind, hand, scene, options)
-            ask_planner(scene, found, options)
-            rows += found
+            of_scene = known[len(rows) :][: len(GOALS)] if options.again else search_all(kind, hand, scene, options)
+            ask_planner(scene, of_scene, options)
+            rows += of_scene
     found = report(rows)
     if not options.quick:
         save("exhaustive_planning", {"summary": found, "rows": rows, "options": vars(options)})

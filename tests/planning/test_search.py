@@ -116,9 +116,9 @@ def test_the_certificate_is_largest_at_the_places_where_phases_change(part, shif
     assert len(places) >= 2
     for k, share in itertools.product(places, (-0.02, 0.02)):
         name, value = best.steps[k].until
-        way = (best.ends[k] - best.begins[k])[COORDINATES.index(name)]
+        displacement = (best.ends[k] - best.begins[k])[COORDINATES.index(name)]
         data = to_dict(best.scene)
-        data["phase"][k]["until"] = {name: value + share * float(way)}
+        data["phase"][k]["until"] = {name: value + share * float(displacement)}
         moved = wa.parse(data)
         if shifted_and_turned.goal.is_reached(np.asarray(wa.trace(moved)[-1].end)):
             assert min(float(one.value) for one in wa.bounds(moved)) < 1.005 * best.bound
@@ -129,8 +129,9 @@ def test_a_place_moved_beyond_its_path_is_no_plan(part, shifted_and_turned):
     assert is_secure(best, regrasps=False)
     k = next(k for k, step in enumerate(best.steps) if step.until is not None)
     name, _ = best.steps[k].until
-    way = (best.ends[k] - best.begins[k])[COORDINATES.index(name)]
-    step = replace(best.steps[k], until=(name, float(best.ends[k][COORDINATES.index(name)] + 20 * way)))
+    row = COORDINATES.index(name)
+    beyond = 20 * (best.ends[k] - best.begins[k])[row]
+    step = replace(best.steps[k], until=(name, float(best.ends[k][row] + beyond)))
     beyond = make_plan(
         part, shifted_and_turned.start, (*best.steps[:k], step, *best.steps[k + 1 :])[: k + 2], 1.0, None
     )

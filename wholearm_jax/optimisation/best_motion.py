@@ -132,9 +132,11 @@ def shortest_duration(
 
 def _solve(*problem) -> PathOptimum:
     """Solve a path's programme, with more effort where the usual one does not suffice."""
-    usual, more = (jax.tree.map(as_device_array, effort) for effort in (ChainEffort(), MORE_EFFORT))
-    found = _solve_path(*problem, usual)
-    return found if found.converged else _solve_path(*problem, more)
+    for effort in (ChainEffort(), MORE_EFFORT):
+        found = _solve_path(*problem, jax.tree.map(as_device_array, effort))
+        if found.converged:
+            break
+    return found
 
 
 def _each_phase(scene: Scene, traced, solve) -> tuple[BestMotion | None, ...]:

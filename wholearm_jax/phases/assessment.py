@@ -82,7 +82,9 @@ def _assess_arrival(dynamics: PathDynamics, motion: Motion, at_rest, arrival, is
     phase_time, s = motion.phase_time[motion.count], motion.s[motion.count]
     max_speed = jnp.sqrt(ARRIVAL_SPEED_FACTOR * jnp.asarray(arrival, s.dtype))
     is_near = jnp.abs(dynamics.breakpoints[-1] - s) <= arrival * dynamics.length
-    is_slow = _stops_within(motion, arrival * dynamics.length, dynamics.length) if is_slow is None else is_slow
+    if is_slow is None:
+        braking_speed = _braking_speed(motion, arrival * dynamics.length, BRAKING_SPEED * dynamics.length)
+        is_slow = motion.w[motion.count] <= jnp.maximum(max_speed * dynamics.length, braking_speed)
     is_late = phase_time >= 1 - max_speed
     ended = motion.status
     reached = (ended == Status.LEFT_FORMATION) | (ended == Status.OK)
@@ -93,16 +95,12 @@ def _assess_arrival(dynamics: PathDynamics, motion: Motion, at_rest, arrival, is
     return jnp.where(arrived, arrival_status, failure)
 
 
-def _stops_within(motion: Motion, distance, length) -> Bool[Array, ""]:
-    """Say whether a motion would stop within a distance, braking as in its last step, or as a uniform motion does."""
+def _braking_speed(motion: Motion, distance, most) -> Float[Array, ""]:
+    """Return the speed, at `most`, from which a motion that brakes as in its last step stops within a distance."""
     last = jnp.maximum(motion.count - 1, 0)
     time = motion.phase_time[motion.count] - motion.phase_time[last]
-    w = motion.w[motion.count]
-    own = (motion.w_begin[last] - w) / jnp.where(time > 0, time, jnp.inf)
-    uniform = jnp.sqrt(ARRIVAL_SPEED_FACTOR * length * distance)
-    return w <= jnp.maximum(
-        uniform, jnp.minimum(jnp.sqrt(2 * jnp.maximum(own, 0.0) * distance), BRAKING_SPEED * length)
-    )
+    braking = (motion.w_begin[last] - motion.w[motion.count]) / jnp.where(time > 0, time, jnp.inf)
+    return jnp.minimum(jnp.sqrt(2 * jnp.maximum(braking, 0.0) * distance), most)
 
 
 def _assess_hold(motion: Motion) -> tuple[Int[Array, ""], Float[Array, ""]]:

@@ -11,23 +11,27 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from wholearm_jax.core import as_device_array
 from wholearm_jax.model import COORDINATES, feature_pair
 from wholearm_jax.planning.moves import move_along
-from wholearm_jax.planning.plans import Plan, Step
+from wholearm_jax.planning.plans import Plan, Step, leading_coordinate
 
-FIRST_SHIFT, LAST_SHIFT = 1 / 4, 1 / 64  # of a place, in the way along its phase
+FIRST_SHIFT, LAST_SHIFT = 1 / 4, 1 / 64  # of a place, as shares of its phase's displacement
 LEAST_GAIN = 1e-3  # of the certificate, for which a place moves
 MAX_TRIES = 60  # plans that are traced, at most
+REACHED = 1e-6  # distance from a place at which a phase is said to end [m, rad]
 
 
-def improve_plan(plan: Plan, radius: float, make: Callable[[tuple[Step, ...], float], Plan | None]) -> Plan:
+def improve_plan(
+    plan: Plan, unit: Float[np.ndarray, "5"], make: Callable[[tuple[Step, ...], float], Plan | None]
+) -> Plan:
     """Move the places between a plan's phases until its certificate is as large as it gets.
 
     Args:
         plan: the plan.
-        radius: of the object [m], the unit of lengths beside angles.
+        unit: of the coordinates.
         make: traces steps as a plan with a certificate above a floor [N]; None where they are none.
 
     Returns:
@@ -37,7 +41,7 @@ def improve_plan(plan: Plan, radius: float, make: Callable[[tuple[Step, ...], fl
     while shift >= LAST_SHIFT and tries > 0:
         moved = False
         for number, share in itertools.product(range(len(plan.steps) - 1), (shift, -shift)):
-            steps = _moved(plan, number, share, radius)
+            steps = _moved(plan, number, share, unit)
             if steps is not None and tries > 0:
                 found, tries = make(steps, (1 + LEAST_GAIN) * plan.bound), tries - 1
                 plan, moved = found or plan, moved or found is not None
@@ -46,18 +50,18 @@ def improve_plan(plan: Plan, radius: float, make: Callable[[tuple[Step, ...], fl
     return plan
 
 
-def _moved(plan: Plan, number: int, share: float, radius: float) -> tuple[Step, ...] | None:
-    """Return a plan's steps with the end of one moved by a share of its way; None where it cannot be."""
+def _moved(plan: Plan, number: int, share: float, unit) -> tuple[Step, ...] | None:
+    """Return a plan's steps with the end of one moved by a share of its displacement; None where it cannot be."""
     step, following = plan.steps[number : number + 2]
     if step.regrasp or following.regrasp:
         return None
     held, kept = ({*map(feature_pair, one.contacts)} for one in (step, following))
     if step.until is None and (share > 0 or not kept <= held):
         return None  # beyond its path's end, or without a contact that comes only there
-    way = plan.ends[number] - plan.begins[number]
-    name = step.until[0] if step.until else COORDINATES[int(np.argmax(np.abs(way) / [radius, radius, 1, 1, 1]))]
+    displacement = plan.ends[number] - plan.begins[number]
+    name = step.until[0] if step.until else leading_coordinate(displacement, unit)
     row = COORDINATES.index(name)
-    until = (name, float(plan.ends[number][row] + share * way[row]))
+    until = (name, float(plan.ends[number][row] + share * displacement[row]))
     return (*plan.steps[:number], replace(step, until=until, leaves=None), *plan.steps[number + 1 :])
 
 
@@ -72,6 +76,6 @@ def is_secure(plan: Plan, *, regrasps: bool) -> bool:
         if step.until is not None and number < len(plan.steps) - 1:
             row = COORDINATES.index(step.until[0])
             last = move.places[move.secure if move.leaves else -1]
-            if abs(end[row] - step.until[1]) > 1e-6 or (last - end)[row] * (end - begin)[row] < 0:
+            if abs(end[row] - step.until[1]) > REACHED or (last - end)[row] * (end - begin)[row] < 0:
                 return False
     return True

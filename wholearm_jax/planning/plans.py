@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from wholearm_jax.core import CachedJit, Status, as_device_array
 from wholearm_jax.margin import margin_upper_bound
-from wholearm_jax.model import Phase, Scene, contact_formation, path_target
+from wholearm_jax.model import COORDINATES, Phase, Scene, contact_formation, path_target
 from wholearm_jax.phases import describe_end, find_hand_overs, trace
 from wholearm_jax.planning.goal import Goal
 
@@ -27,6 +27,11 @@ class Step:
     regrasp: str | None = None  # what a finger does that moves alone, as scene files write it
     leaves: str | None = None  # the contact that is at its feature's end there: no next phase keeps it
     delay: float = 0.0  # by how many phases later the search goes on from there
+
+
+def leading_coordinate(displacement: Float[np.ndarray, "5"], unit: Float[np.ndarray, "5"]) -> str:
+    """Name the coordinate that a displacement changes most, each over its unit."""
+    return COORDINATES[int(np.argmax(np.abs(displacement) / unit))]
 
 
 def contact_left(steps: tuple[Step, ...]) -> str | None:

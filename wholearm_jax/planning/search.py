@@ -17,7 +17,7 @@ import heapq
 import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import equinox as eqx
@@ -27,7 +27,6 @@ from wholearm_jax.core import as_device_array, require_x64
 from wholearm_jax.model import (
     ANGLE_COORDINATES,
     AWAY_NAMES,
-    COORDINATES,
     Scene,
     feature_pair,
     object_radius,
@@ -36,6 +35,7 @@ from wholearm_jax.model import (
 from wholearm_jax.phases import describe_overlaps, possible_hand_overs, trace
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.improvement import improve_plan, is_secure
+from wholearm_jax.planning.move_stops import move_stops
 from wholearm_jax.planning.moves import SHORTEST_MOVE, Move, moves_from
 from wholearm_jax.planning.obstructions import explain_failure, explain_far_goal
 from wholearm_jax.planning.plans import (
@@ -50,13 +50,7 @@ from wholearm_jax.planning.plans import (
 from wholearm_jax.planning.regrasps import regrasp_stops, separate_regrasps
 from wholearm_jax.planning.successors import touching_contacts
 
-STOPS = {  # fractions of a path at which other moves may begin, and by how many phases later they are tried
-    **dict.fromkeys((1 / 3, 2 / 3), 0.0),
-    **dict.fromkeys((1 / 6, 1 / 2, 5 / 6), 1.0),
-    **dict.fromkeys((1 / 12, 1 / 4, 5 / 12, 7 / 12, 3 / 4, 11 / 12), 2.0),
-}
-AT_TIP = 3.0  # by how many phases later an arrival is taken at which a contact leaves its feature, as at a tip
-BEYOND_BEGIN = 1e-3  # how far beyond a step's begin the way back leads on, at least [object radii, rad]
+BEYOND_BEGIN = 1e-3  # how far beyond a step's begin a move back leads on, at least [object radii, rad]
 MERGE_TOL = 1e-5  # configurations closer than this, in object radii and radians, are one node
 TYPICAL_SHIFT, TYPICAL_TURN = 0.5, 0.5  # of one move [object radii, rad], for the estimate of phases to come
 SHORT_PLAN = 5  # phases
@@ -73,7 +67,7 @@ class _Search:
     start: np.ndarray
     goal: Goal
     floor: float
-    radius: float
+    unit: np.ndarray  # (5,) of the coordinates: lengths in radii
     max_phases: int
     duration: float
     count: int
@@ -138,12 +132,13 @@ def plan(
     if regrasp_cost is not None and not 0 <= regrasp_cost < np.inf:
         raise ValueError(f"regrasp_cost must be a number of at least 0, not {regrasp_cost}")
     start, touching = _start(scene)
+    radius = object_radius(scene.object)
     search = _Search(
         scene=scene,
         start=start,
         goal=make_goal(start, goal, by=by, tolerance=tolerance),
         floor=margin,
-        radius=object_radius(scene.object),
+        unit=np.array([radius, radius, 1, 1, 1]),
         max_phases=max_phases,
         duration=duration,
         count=count,
@@ -158,7 +153,7 @@ def plan(
     out_of_time = _run(search, time_limit, max_nodes, callback)
     nearest, reason = None, ""
     again = functools.partial(_make_secure_plan, search)
-    improved = [improve_plan(one, search.radius, again) for one in search.plans]
+    improved = [improve_plan(one, search.unit, again) for one in search.plans]
     if not search.plans:
         steps = search.nearest[1]
         nearest = make_plan(scene, start, steps, duration, None) if steps else None
@@ -276,8 +271,7 @@ def _ranked(search: _Search, plans: list[Plan]) -> list[Plan]:
 
 def _push(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching: tuple[str, ...] | None) -> None:
     """Add a configuration to the queues unless it is there already, or no plan may go on from it."""
-    unit = np.array([search.radius, search.radius, 1, 1, 1])
-    key = (contact_left(steps), *np.round(z / unit / MERGE_TOL).astype(int).tolist())
+    key = (contact_left(steps), *np.round(z / search.unit / MERGE_TOL).astype(int).tolist())
     arrived = search.goal.is_reached(z)
     if key in search.visited and not arrived:  # other ways to the goal are other plans
         return
@@ -305,7 +299,7 @@ def _delay(steps: tuple[Step, ...]) -> float:
 
 def _phases_to_go(search: _Search, z: np.ndarray) -> float:
     """Estimate how many moves lead from a configuration to the goal; 0 within its tolerances."""
-    shift = TYPICAL_SHIFT * search.radius
+    shift = TYPICAL_SHIFT * search.unit[0]
     sizes = [TYPICAL_TURN if name in ANGLE_COORDINATES else shift for name in search.goal.values]
     tolerances = np.array([search.goal.tolerance[name] for name in search.goal.values])
     return float((np.maximum(search.goal.distance(z) - tolerances, 0.0) / sizes).sum())
@@ -319,7 +313,12 @@ def _expand(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching) -
     search.nodes += 1
     search.moves += len(moves)
     alone, others = separate_regrasps(moves) if regrasps else ((), moves)
-    stops = [(move, stop) for move in others if _leads_on(search, steps, move) for stop in _stops(search, move)]
+    stops = [
+        (move, stop)
+        for move in others
+        if _leads_on(search, steps, move)
+        for stop in move_stops(move, search.goal, search.unit)
+    ]
     last = steps[-1].regrasp if steps else None
     survives = _hand_over_check(search, steps)
     capacity = search.scene.object.vertices.shape[0]
@@ -339,9 +338,13 @@ def _leads_on(search: _Search, steps: tuple[Step, ...], move: Move) -> bool:
     """
     if not steps or move.contacts != steps[-1].contacts:
         return True
-    begin = steps[-2].end if len(steps) > 1 else search.start
-    beyond = np.abs(move.places[-1] - begin) / np.array([search.radius, search.radius, 1, 1, 1])
+    beyond = np.abs(move.places[-1] - _begin_of_last(search, steps)) / search.unit
     return bool(BEYOND_BEGIN < beyond.max() <= SHORTEST_MOVE)
+
+
+def _begin_of_last(search: _Search, steps: tuple[Step, ...]) -> np.ndarray:
+    """Return the configuration at which the last of some steps began."""
+    return steps[-2].end if len(steps) > 1 else search.start
 
 
 def _hand_over_check(search: _Search, steps: tuple[Step, ...]) -> Callable[[Move, Step], bool]:
@@ -352,7 +355,7 @@ def _hand_over_check(search: _Search, steps: tuple[Step, ...]) -> Callable[[Move
         if last is None or not any(possible_hand_overs(last.contacts, move.contacts, count)):
             return True
         if move.contacts not in known:
-            begin = steps[-2].end if len(steps) > 1 else search.start
+            begin = _begin_of_last(search, steps)
             known[move.contacts] = survives_hand_over(search.scene, begin, (last, step), search.duration)
         return known[move.contacts]
 
@@ -362,39 +365,3 @@ def _hand_over_check(search: _Search, steps: tuple[Step, ...]) -> Callable[[Move
 def _names(move: Move) -> tuple[str, ...]:
     """Name the contacts that touch between the ends of a path."""
     return tuple(feature_pair(name) for name in move.contacts if name not in AWAY_NAMES)
-
-
-def _stops(search: _Search, move: Move) -> Iterator[tuple[Step, bool]]:
-    """Yield the places at which a move may be left: the goal's coordinates, its end, and a few between.
-
-    Of two that reach the goal the search takes the first: where a path meets the goal itself, not its end nearby.
-    """
-    lowest = np.minimum.accumulate(move.margins)
-    last = len(move.places) - 1
-    for name, value in search.goal.values.items():
-        yield from _crossings(move, lowest, name, value)
-    end = move.places[last]
-    delay = AT_TIP if move.leaves and search.goal.is_reached(end) else 0.0
-    yield Step(move.contacts, move.toward, None, end, float(lowest[last]), leaves=move.leaves, delay=delay), True
-    displacement = np.abs(move.places[last] - move.places[0]) / np.array([search.radius, search.radius, 1, 1, 1])
-    name = COORDINATES[int(np.argmax(displacement))]
-    stops = {round(fraction * last): delay for fraction, delay in STOPS.items()}
-    if move.leaves:  # a hand that is to go on with the contact stops before its feature's end
-        stops[move.secure] = 0.0
-    for place, delay in stops.items():
-        value = float(move.places[place][COORDINATES.index(name)])
-        for step, is_end in itertools.islice(_crossings(move, lowest, name, value), 1):
-            yield replace(step, delay=delay), is_end
-
-
-def _crossings(move: Move, lowest: np.ndarray, name: str, value: float) -> Iterator[tuple[Step, bool]]:
-    """Yield the places of a move at which a coordinate first has a value, strictly between its ends."""
-    row = COORDINATES.index(name)
-    off = move.places[:, row] - value
-    crossed = np.flatnonzero((off[:-1] != 0) & (off[:-1] * off[1:] <= 0))
-    if len(crossed) and crossed[0] + 1 < len(off):
-        k = int(crossed[0])
-        fraction = off[k] / (off[k] - off[k + 1])
-        z = move.places[k] + fraction * (move.places[k + 1] - move.places[k])
-        if 0 < k + fraction < len(off) - 1 - 1e-6:
-            yield Step(move.contacts, move.toward, (name, value), z, float(lowest[k + 1])), False
