@@ -73,8 +73,12 @@ class CachedJit:
         program = self._programs.get(key)
         if program is None:
             with self._locks.setdefault(key, threading.Lock()):  # another thread may be compiling it
-                program = self._programs.get(key) or self._build(arrays, tree, settings, folder, traced)
-                self._programs[key] = program
+                program = self._programs.get(key)
+                if program is None:
+                    program = self._build(arrays, tree, settings, folder, traced)
+                    results = program(*arrays)  # compiles, unless it is from the folder
+                    self._programs[key] = program
+                    return results
         return program(*arrays)
 
     def embedded(self, *args) -> Callable:

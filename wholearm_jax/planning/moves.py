@@ -27,7 +27,7 @@ from wholearm_jax.model import (
     scaled_mechanics,
 )
 from wholearm_jax.phases import configuration, trace_phase
-from wholearm_jax.planning.path_choices import path_choices
+from wholearm_jax.planning.path_choices import PathChoice, path_choices
 from wholearm_jax.planning.successors import touching_contacts
 from wholearm_jax.tracing import PathEnd, Resolution, feature_clearance, pivot_clearance
 
@@ -73,6 +73,7 @@ def moves_from(
     left: str | None = None,
     rolling: bool = True,
     regrasps: bool = False,
+    floor: float = -np.inf,
 ) -> tuple[Move, ...]:
     """Return all moves from a configuration: formations `2R + S = 4` of what touches, sliding and rolling, both ways.
 
@@ -87,18 +88,22 @@ def moves_from(
         left: the contact, if any, at whose feature's end the path to `z` has ended.
         rolling: whether contacts may roll.
         regrasps: whether a finger may be away.
+        floor: margin at rest [N] that a move has to exceed where it begins; unless given, none has to.
     """
     names = touching_contacts(scene, z) if touching is None else touching
-    choices = path_choices(scene, z, names, rolling=rolling, away=AWAY_NAMES if regrasps else ())
+    choices = path_choices(scene, z, names, rolling=rolling, away=AWAY_NAMES if regrasps else (), floor=floor)
     chosen = [choice for choice in choices if left not in {*map(feature_pair, choice[0])}]
-    parts = [chosen[first : first + MOVES_PER_CALL] for first in range(0, len(chosen), MOVES_PER_CALL)]
-    if not parts:
-        return ()
-    first, others = _trace(scene, z, regrasps, parts[0]), parts[1:]  # compiles, once
-    traced = [first, *_threads().map(functools.partial(_trace, scene, z, regrasps), others)]
+    parts = _parts(chosen)
+    traced = _threads().map(functools.partial(_trace, scene, z, regrasps), parts)
     pairs = [(choice, paths, k) for part, paths in zip(parts, traced, strict=True) for k, choice in enumerate(part)]
     moves = (_as_move(*choice, jax.tree.map(lambda a, k=k: a[k], paths)) for choice, paths, k in pairs)
     return tuple(move for move in moves if move is not None)
+
+
+def _parts(chosen: list[PathChoice]) -> list[list[PathChoice]]:
+    """Share choices out among the processors, in calls of at most `MOVES_PER_CALL`."""
+    calls = max(-(-len(chosen) // MOVES_PER_CALL), min(len(chosen), os.cpu_count() or 1))
+    return [chosen[first::calls] for first in range(calls)]
 
 
 def move_along(
@@ -143,20 +148,21 @@ def _target(toward: str) -> PathTarget:
 
 
 def _trace(scene: Scene, z, regrasps: bool, chosen) -> _Paths:
-    """Trace the paths of at most `MOVES_PER_CALL` choices; the first is repeated to fill up the call."""
-    chosen = [*chosen, *chosen[:1] * (MOVES_PER_CALL - len(chosen))]
+    """Trace the paths of at most `MOVES_PER_CALL` choices."""
+    count, rows = np.array(len(chosen)), MOVES_PER_CALL - len(chosen)
+    chosen = [*chosen, *chosen[:1] * rows]  # rows of arrays that are not looked at
     every = [_formation(contacts) for contacts, _ in chosen]
     if regrasps:  # one program, whether or not a finger is away in one of them
         every = alike_formations([*every, _formation(AWAY_NAMES[:1])])[:-1]
     formations = jax.tree.map(lambda *rows: np.stack(rows), *every)
     targets = jax.tree.map(lambda *rows: np.stack(rows), *(_target(toward) for _, toward in chosen))
-    paths = _trace_moves(rigid_body(scene.object), scene.hand, scene.gravity, formations, targets, np.asarray(z))
-    return jax.device_get(paths)
+    body = rigid_body(scene.object)
+    return jax.device_get(_trace_moves(body, scene.hand, scene.gravity, formations, targets, np.asarray(z), count))
 
 
 @CachedJit
-def _trace_moves(body, hand, gravity, formations, targets, z) -> _Paths:
-    """Trace and tabulate paths one after the other, and sample places and margins."""
+def _trace_moves(body, hand, gravity, formations, targets, z, count) -> _Paths:
+    """Trace and tabulate the first `count` paths one after the other, and sample places and margins."""
 
     def one(move):
         formation, target = move
@@ -178,4 +184,10 @@ def _trace_moves(body, hand, gravity, formations, targets, z) -> _Paths:
         secure = jnp.where(inside >= LEAST_HOLD, jnp.arange(PLACES), 0).max()
         return _Paths(dynamics.status, dynamics.length, pivot, places, margins, reason, contact, secure)
 
-    return jax.lax.map(one, (formations, targets))
+    def next_one(k, paths: _Paths) -> _Paths:
+        found = one(jax.tree.map(lambda rows: rows[k], (formations, targets)))
+        return jax.tree.map(lambda rows, row: rows.at[k].set(row), paths, found)
+
+    moves = formations, targets
+    none = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(lambda: jax.lax.map(one, moves)))
+    return jax.lax.fori_loop(0, count, next_one, none)

@@ -3,27 +3,15 @@
 import itertools
 from collections.abc import Iterator, Sequence
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from wholearm_jax.core import CachedJit
 from wholearm_jax.margin import MAX_ROLLING
-from wholearm_jax.model import (
-    AWAY_NAMES,
-    COORDINATES,
-    Scene,
-    constraint_jacobian,
-    contact_formation,
-    contact_kinematics,
-    feature_pair,
-    rigid_body,
-    scaled_mechanics,
-)
-from wholearm_jax.tracing import hold_same_tip
+from wholearm_jax.model import AWAY_NAMES, COORDINATES, Scene, feature_pair
+from wholearm_jax.planning.contact_rows import ContactRows, contact_rows
+from wholearm_jax.planning.rest_margins import path_tangents, rest_margins
 
-WEDGING_CONDITION = 1e-6  # share of the largest singular value below which four constraints do not fix a path
-ROWS_STEP = 8  # contacts whose rows one program computes; their number is rounded up to a multiple
+PathChoice = tuple[tuple[str, ...], str]  # names of a formation's contacts, and the direction as scene files write it
 
 
 def formation_names(contacts: Sequence[str], rolling: bool) -> Iterator[tuple[str, ...]]:
@@ -46,8 +34,14 @@ def _is_possible(names: Sequence[str]) -> bool:
 
 
 def path_choices(
-    scene: Scene, z: Float[Array, "5"], contacts: Sequence[str], *, rolling: bool, away: Sequence[str] = ()
-) -> Iterator[tuple[tuple[str, ...], str]]:
+    scene: Scene,
+    z: Float[Array, "5"],
+    contacts: Sequence[str],
+    *,
+    rolling: bool,
+    away: Sequence[str] = (),
+    floor: float = -np.inf,
+) -> Iterator[PathChoice]:
     """Yield each formation of contacts whose constraints fix a path, with either direction along it.
 
     Left out are those of which two contacts hold a fingertip at a vertex.
@@ -58,52 +52,36 @@ def path_choices(
         contacts: names of the contacts to combine, as if none rolled.
         rolling: whether contacts may roll.
         away: fingers that may stand still without a contact, such as `finger1:away`.
+        floor: margin at rest [N] that a way along a path has to exceed where it begins; unless given, none has to.
 
     Yields:
         The names of a formation's contacts and the direction as scene files write it, by the coordinate that changes
         most: `("palm:v5", ...), "x-"`.
     """
     combinations = tuple(names for names in formation_names([*contacts, *away], rolling) if _is_possible(names))
-    directions = _path_directions(scene, z, contacts, combinations) if combinations else ()
-    for names, direction in zip(combinations, directions, strict=True):
-        if direction is not None:
-            steepest = COORDINATES[int(np.argmax(np.abs(direction)))]
-            yield names, f"{steepest}-"
-            yield names, f"{steepest}+"
+    if not combinations:
+        return
+    rows = contact_rows(scene, np.asarray(z)[None], contacts, away)
+    for rolls, group in itertools.groupby(combinations, key=_rolling_count):
+        chosen = tuple(group)
+        tangents = path_tangents(rows, contact_numbers(rows, chosen), rolls)
+        margins = [rest_margins(rows, tangents, way)[0] for way in (-1, 1)] if floor > -np.inf else None
+        for k, names in enumerate(chosen):
+            numbers, direction = tangents.number[k], tangents.direction[0, k]
+            if not tangents.is_path[0, k] or rows.same_tip[np.ix_(numbers, numbers)].any():
+                continue
+            steepest = int(np.argmax(np.abs(direction)))
+            for sign, way in (("-", 0), ("+", 1)):
+                along = way if direction[steepest] > 0 else 1 - way
+                if margins is None or margins[along][k] > floor:
+                    yield names, f"{COORDINATES[steepest]}{sign}"
 
 
-def _path_directions(scene: Scene, z, contacts: Sequence[str], combinations) -> list[np.ndarray | None]:
-    """Return the direction of each combination's path in the object's units; None where constraints depend."""
-    # The normal and the tangential row of each contact, as if all rolled: one program for up to `ROWS_STEP` contacts.
-    padded = [*contacts, *[contacts[0]] * (-len(contacts) % ROWS_STEP)]
-    every = contact_formation([f"{name} rolling" for name in padded])
-    at_z = _constraint_rows(rigid_body(scene.object), scene.hand, scene.gravity, every, jnp.asarray(z))
-    rows, twice = (np.asarray(a) for a in at_z)
-    rows_of = {name: rows[2 * k : 2 * k + 2] for k, name in enumerate(contacts)}
-    rows_of |= {name: np.eye(5)[3 + k : 4 + k] for k, name in enumerate(AWAY_NAMES)}
-    number = {name: k for k, name in enumerate(contacts)}
-    # A path's direction is the null vector of its four rows.
-    stacked = np.stack([np.concatenate([_rows_held(rows_of, name) for name in names]) for names in combinations])
-    _, values, right = np.linalg.svd(stacked)
-    independent = values[:, -1] > WEDGING_CONDITION * values[:, 0]
-    may_hold = [not _holds_twice(names, number, twice[::2, ::2]) for names in combinations]
-    return [right[k, 4] if independent[k] and may_hold[k] else None for k in range(len(combinations))]
+def _rolling_count(names: Sequence[str]) -> int:
+    return sum(name != feature_pair(name) for name in names)
 
 
-def _holds_twice(names: Sequence[str], number: dict[str, int], twice: np.ndarray) -> bool:
-    """Whether two of the contacts hold one fingertip at a vertex; `twice` says so of each two of all."""
-    chosen = [number[pair] for name in names if (pair := feature_pair(name)) in number]
-    return bool(twice[np.ix_(chosen, chosen)].any())
-
-
-def _rows_held(rows_of: dict[str, np.ndarray], name: str) -> np.ndarray:
-    contact, _, rolls = name.partition(" ")
-    return rows_of[contact] if rolls else rows_of[contact][:1]
-
-
-@CachedJit
-def _constraint_rows(body, hand, gravity, formation, z):
-    mechanics = scaled_mechanics(body, hand, gravity, formation)
-    small = z / mechanics.configuration_unit
-    contacts, at = mechanics.contacts, contact_kinematics(mechanics.contacts, small)
-    return constraint_jacobian(contacts, small), hold_same_tip(contacts, at, contacts, at)
+def contact_numbers(rows: ContactRows, combinations: Sequence[Sequence[str]]) -> Int[np.ndarray, "formations contacts"]:
+    """Number the contacts of formations among the rows."""
+    number = {name: k for k, name in enumerate(rows.names)}
+    return np.array([[number[feature_pair(name)] for name in names] for names in combinations])

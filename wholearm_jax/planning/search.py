@@ -309,7 +309,8 @@ def _expand(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching) -
     """Trace all moves from a configuration and push the places at which they may be left."""
     regrasps = search.regrasp_cost is not None
     left, here = contact_left(steps), as_device_array(z)
-    moves = moves_from(search.scene, here, touching, left=left, rolling=search.rolling, regrasps=regrasps)
+    options = {"rolling": search.rolling, "regrasps": regrasps, "floor": search.floor}
+    moves = moves_from(search.scene, here, touching, left=left, **options)
     search.nodes += 1
     search.moves += len(moves)
     alone, others = separate_regrasps(moves) if regrasps else ((), moves)
