@@ -15,11 +15,9 @@ from wholearm_jax.core import CachedJit, Status
 from wholearm_jax.margin import best_quasistatic_torque
 from wholearm_jax.model import (
     AWAY_NAMES,
-    ContactFormation,
     PathTarget,
     Scene,
     alike_formations,
-    contact_formation,
     contact_kinematics,
     feature_pair,
     path_target,
@@ -27,6 +25,7 @@ from wholearm_jax.model import (
     scaled_mechanics,
 )
 from wholearm_jax.phases import configuration, trace_phase
+from wholearm_jax.planning.contact_rows import formation_in_numpy
 from wholearm_jax.planning.path_choices import PathChoice, path_choices
 from wholearm_jax.planning.successors import touching_contacts
 from wholearm_jax.tracing import PathEnd, Resolution, feature_clearance, pivot_clearance
@@ -130,15 +129,9 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count())
 
 
-# In NumPy: passing its arrays to a compiled program takes a tenth of the time of moving each to a device.
-@functools.lru_cache(maxsize=4096)
-def _formation(contacts: tuple[str, ...]) -> ContactFormation:
-    return jax.tree.map(np.asarray, contact_formation(contacts))
-
-
 def _contact_of_row(contacts: tuple[str, ...], row: int) -> str:
     """Name the contact, as if it slid, of a row of a formation's constraints."""
-    formation = _formation(contacts)
+    formation = formation_in_numpy(contacts)
     return feature_pair(formation.names[formation.contact_of_row[row]])
 
 
@@ -151,9 +144,9 @@ def _trace(scene: Scene, z, regrasps: bool, chosen) -> _Paths:
     """Trace the paths of at most `MOVES_PER_CALL` choices."""
     count, rows = np.array(len(chosen)), MOVES_PER_CALL - len(chosen)
     chosen = [*chosen, *chosen[:1] * rows]  # rows of arrays that are not looked at
-    every = [_formation(contacts) for contacts, _ in chosen]
+    every = [formation_in_numpy(contacts) for contacts, _ in chosen]
     if regrasps:  # one program, whether or not a finger is away in one of them
-        every = alike_formations([*every, _formation(AWAY_NAMES[:1])])[:-1]
+        every = alike_formations([*every, formation_in_numpy(AWAY_NAMES[:1])])[:-1]
     formations = jax.tree.map(lambda *rows: np.stack(rows), *every)
     targets = jax.tree.map(lambda *rows: np.stack(rows), *(_target(toward) for _, toward in chosen))
     body = rigid_body(scene.object)
