@@ -142,6 +142,46 @@ def test_a_controller_of_another_plan_is_refused(controller):
         execute(wa.simulate(other, wa.quasistatic(other)), controller=controller)
 
 
+def test_a_path_on_which_the_joints_stand_still_has_no_law(tmp_path, wholearm):
+    """A triangle turns about its vertex on the palm, held by finger 1 alone: where that is perpendicular to the line
+    from there to the vertex that it holds, it turns back."""
+    radius, joint = 0.03, 0.05
+    corners = radius * np.array([[0.0, 0.0], *([np.cos(a), np.sin(a)] for a in np.deg2rad([40, 145]))])
+    middle, finger = corners.mean(0), {"length": 0.05, "inertia": 1e-4, "torque_limit": 1.0}
+    turn = {
+        "name": "turn",
+        "contacts": ["palm:v0 rolling", "finger1:v1", "finger2:away"],
+        "toward": "phi+",
+        "until": {"phi": 0.45},
+        "duration": 1.0,
+    }
+    scene = wa.parse(
+        {
+            "title": "triangle",
+            "gravity": 9.81,
+            "hand": {f"finger{k}": finger | {"joint": [x, 0.0]} for k, x in ((1, joint), (2, -joint))},
+            "object": {"vertices": (corners - middle).tolist(), "mass": 0.2, "friction": 0.6},
+            "start": {
+                **dict(zip("xy", middle.tolist(), strict=True)),
+                "phi": 0.0,
+                "theta1": float(np.arctan2(corners[1, 1], corners[1, 0] - joint)),
+                "theta2": 3.0,
+            },
+            "phase": [turn],
+        }
+    )
+    still = f"'turn': both joints stand still where theta1 is {180 - np.degrees(np.arcsin(radius / joint)):.1f} deg"
+    with pytest.raises(ValueError, match=still):
+        wa.feedback(scene, wa.quasistatic(scene))
+
+    wa.save(scene, tmp_path / "triangle.toml")
+    code, out, err = wholearm("optimise", tmp_path / "triangle.toml", "--feedback", "--out", tmp_path / "out")
+    assert code == 1, "as where no law holds"
+    assert "ok, margin" in out
+    assert f"no controller.json: {still}" in err
+    assert not (tmp_path / "out" / "controller.json").exists()
+
+
 @pytest.mark.parametrize("wrong", [{"friction": 1.0}, {"stiffness": 0.0}])
 def test_numbers_out_of_range_are_refused(scene, wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):

@@ -116,7 +116,11 @@ def _design(optimum, uncertain: dict[str, float], as_json: bool):
 
     objects: dict[str, Any] = {name: uncertain.get(name, 0.0) for name in ("friction", "mass")}
     objects["shape"] = uncertain.get("vertices")
-    controller = feedback(optimum.scene, optimum.torque, **objects)
+    try:
+        controller = feedback(optimum.scene, optimum.torque, **objects)
+    except ValueError as error:
+        note(f"no controller.json: {error}")
+        return None
     for phase in controller.phases if not as_json else ():
         print(f"{phase.name}: closed loop, least force {phase.margin:.4g} N over all objects of the set")
     weakest = min(controller.phases, key=lambda phase: phase.margin)

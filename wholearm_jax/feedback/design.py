@@ -131,7 +131,7 @@ def feedback(
     _require_motions(result, own_motion)
     scenes = corner_scenes(scene, friction, mass)
     traces = [tuple(phase.traced for phase in result.phases), *(trace(other) for other in scenes[1:])]
-    tables = [tabulate_path(path.dynamics) for path in traces[0]]
+    tables = _path_tables(scene, traces[0])
     shapes = draw_shapes(scenes, shape)
     drawn = [trace(other) for other in shapes]
     others = draw_shapes([scene], shape, seed=1, count=SHAPES_AT_STOPS - len(drawn))
@@ -171,6 +171,17 @@ def feedback(
             another = _with_simulated_margins(replace(controller, **faster), parts)
             held = max(held, another, key=lambda one: one.margin)
     return held
+
+
+def _path_tables(scene: Scene, paths) -> list[PathTable]:
+    """Tabulate a plan's paths. Raises ValueError, with the phase's name, where joint angles do not tell a place."""
+    tables = []
+    for phase, path in zip(scene.phases, paths, strict=True):
+        try:
+            tables.append(tabulate_path(path.dynamics))
+        except ValueError as error:
+            raise ValueError(f"'{phase.name}': {error}") from None
+    return tables
 
 
 def _default_rates(scene: Scene, tables: list[PathTable]) -> list[dict[str, float]]:

@@ -11,6 +11,7 @@ from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.margin import cone_facets
 
 NODES = 300  # of a path, those of each segment evenly spaced
+STANDING_STILL = 1e-3  # how fast the joints move along a path, over the fastest, where they count as standing still
 
 
 class PathTable(NamedTuple):
@@ -50,8 +51,12 @@ def tabulate_path(dynamics: PathDynamics, nodes: int = NODES) -> PathTable:
     segment, parameter = np.repeat(np.arange(count), each), np.concatenate(parts)
     z, x = jax.device_get(_geometry(dynamics, jnp.asarray(segment), jnp.asarray(parameter)))
     rate = np.hypot(*x[:, 3:].T)
-    if not rate.min() > 1e-3 * rate.max():
-        raise ValueError("both joints stand still on the path: their angles do not say where the object is")
+    if not rate.min() > STANDING_STILL * rate.max():
+        first, second = np.degrees(z[rate.argmin(), 3:])
+        raise ValueError(
+            f"both joints stand still where theta1 is {first:.1f} deg and theta2 {second:.1f} deg, so that their angles"
+            " do not say where the object is: no law can follow its path"
+        )
     s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(z[:, 3:], axis=0).T))])
     return PathTable(segment, parameter, 1 / rate, s, z[:, 3:], x[:, 3:] / rate[:, None])
 
