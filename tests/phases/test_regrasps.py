@@ -13,11 +13,12 @@ from wholearm_jax.core import SceneError
 from wholearm_jax.ensembles import make_ensemble, optimise_robustly
 from wholearm_jax.execution.executions import ExecutionOutcome, execute, rollout
 from wholearm_jax.execution.mujoco_model import build_mujoco_model
+from wholearm_jax.feedback import law_tables
 from wholearm_jax.files import load_start
 from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.margin import contact_statics, rest_margin, without_joint
 from wholearm_jax.model import contact_formation
-from wholearm_jax.phases import describe_end
+from wholearm_jax.phases import closed_loop_result, describe_end
 
 
 def scene_data():
@@ -316,3 +317,19 @@ def test_a_law_does_not_press_the_object_against_a_finger_that_is_away(data):
     pushes = wa.trace(scene)[1]
     assert describe_end(scene, scene.phases[1], pushes) == "finger1:v6 is made"
     assert wa.feedback(scene, wa.optimise(scene, knots=21).torque, friction=0.05).phases[1].press == 0.0
+
+
+def test_a_law_holds_the_object_until_the_next_phase_begins(data, optimum):
+    """A finger that moves alone arrives a little before its phase's end; what the law exerts holds the object on."""
+    scene = wa.parse(data)
+    law = wa.feedback(scene, optimum.torque)
+    assert all(phase.margin > 0 for phase in law.phases)
+    result = closed_loop_result(scene, law_tables(law))
+    assert [phase.status for phase in result.phases] == [wa.Status.OK] * 3, result.message
+    assert all(law.margin <= float(phase.margin) + 1e-6 for law, phase in zip(law.phases, result.phases, strict=True))
+    assert int(wa.check([scene], controller=law).status[0]) == wa.Status.OK
+    # Up to every phase's end the torque is the last that the law exerts in it.
+    times, torques = np.asarray(result.torque.times), np.asarray(result.torque.values)
+    for phase in result.phases[:-1]:
+        at_end = np.flatnonzero(np.abs(times - phase.start - phase.duration) < 1e-9)
+        np.testing.assert_array_equal(torques[at_end[0]], torques[at_end[0] - 1])

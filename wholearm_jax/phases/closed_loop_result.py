@@ -55,7 +55,7 @@ def closed_loop_result(
 
 
 def _exerted(law: LawTables, traced: tuple[TracedPhase, ...], phases: Sequence[SimulatedPhase]) -> TorqueSchedule:
-    """Return the torques of the law where the steps of a motion begin and end."""
+    """Return the torques of the law where the steps of a motion begin and end; the last one holds to the phase's end."""
     times, torques = [], []
     for k, (path, one) in enumerate(zip(traced, phases, strict=True)):
         motion, count = one.motion, int(one.motion.count)
@@ -64,8 +64,9 @@ def _exerted(law: LawTables, traced: tuple[TracedPhase, ...], phases: Sequence[S
         tables = jax.tree.map(lambda leaf, k=k: leaf[k], law.phases)
         both = _step_torques(phase_loop(law, tables, path.dynamics), motion)
         nodes = np.stack([np.asarray(motion.phase_time[:-1]), np.asarray(motion.phase_time[1:])], axis=1)[:count]
-        times.append(float(one.start) + float(one.duration) * nodes.ravel())
-        torques.append(np.asarray(both)[:count].reshape(-1, 2))
+        exerted = np.asarray(both)[:count].reshape(-1, 2)
+        times.append(float(one.start) + float(one.duration) * np.append(nodes, max(nodes[-1, 1], 1.0)))
+        torques.append(np.concatenate([exerted, exerted[-1:]]))
     if not times:
         return uniform_schedule(1.0, np.zeros((2, 2)))
     return TorqueSchedule(as_device_array(np.concatenate(times)), as_device_array(np.concatenate(torques)))
