@@ -55,7 +55,7 @@ def closed_loop_result(
 
 
 def _exerted(law: LawTables, traced: tuple[TracedPhase, ...], phases: Sequence[SimulatedPhase]) -> TorqueSchedule:
-    """Return the torques of the law where the steps of a motion begin and end; the last one holds to the phase's end."""
+    """Return the torques of the law at both ends of a motion's steps; the last one holds to the phase's end."""
     times, torques = [], []
     for k, (path, one) in enumerate(zip(traced, phases, strict=True)):
         motion, count = one.motion, int(one.motion.count)
