@@ -61,12 +61,27 @@ def test_phases_without_a_stop_that_are_too_slow_are_told_durations_that_work():
     for k, phase in enumerate(scene.phases):
         scene = with_duration(scene, k, 30 * float(phase.duration))
     slow = wa.optimise(scene).result
-    (said,) = {phase.message.partition("so slowly")[2] for phase in slow.phases if phase.status is not wa.Status.OK}
-    advised = re.findall(r"--set (\d)\.duration=([\d.]+)", said)
+    said = [phase.message.partition("so slowly")[2] for phase in slow.phases if phase.status is not wa.Status.OK]
+    (advised,) = {tuple(re.findall(r"--set (\d)\.duration=([\d.]+)", each)) for each in said}
     assert [int(k) for k, _ in advised] == [0, 1, 2]
+    assert all('), or stop before the change of formation (`arrive = "rest"` in phase \'' in each for each in said)
     for k, seconds in advised:
         scene = with_duration(scene, int(k), float(seconds))
     assert wa.optimise(scene).result.status is wa.Status.OK
+
+
+def test_where_an_impact_opens_a_contact_a_stop_before_it_is_advised(heptagon):
+    """The impulses at the heptagon's flip pull: at no speed does the object pass; with the stop advised it is the
+    bundled plan."""
+    data = to_dict(heptagon)
+    data["phase"][0]["arrive"] = "moving"
+    slide, flip = wa.optimise(wa.parse(data), knots=KNOTS).result.phases
+    assert slide.status is wa.Status.OK
+    assert re.search(r"the impact at its beginning opens it .*; stop before the change of formation", flip.message)
+    assert f"`arrive = \"rest\"` in phase '{slide.name}'" in flip.message
+    assert "duration" not in flip.message
+    data["phase"][0]["arrive"] = "rest"
+    assert wa.optimise(wa.parse(data), knots=KNOTS).result.status is wa.Status.OK
 
 
 def test_another_schedule_is_advised_to_be_optimised(heptagon):

@@ -22,6 +22,7 @@ from wholearm_jax.optimisation.best_motion import convex_bounds, shortest_motion
 from wholearm_jax.optimisation.quasistatic_plan import bounds
 from wholearm_jax.optimisation.singular_advice import explain_singular
 from wholearm_jax.phases import (
+    OPENING_ADVICE,
     HandOver,
     PhaseResult,
     Result,
@@ -159,9 +160,13 @@ def _explain_motion(
         return detail, f"give it more time ({longer})"
     if search is None:
         return phase.detail, f"{_first_half(phase)}; {REMEDY_OPTIMISE}"
+    stopping = f"stop before the change of formation (`arrive = \"rest\"` in phase '{stop}')"
+    if phase.is_opened_at_its_beginning and stop is not None:
+        return None, stopping
     if shorter:
         changes = " ".join(f"--set {k}.duration={duration:g}" for k, duration in shorter.items())
-        return "so slowly no torques led it through the phases without a stop", f"give them less time ({changes})"
+        detail = "so slowly no torques led it through the phases without a stop"
+        return detail, f"give them less time ({changes}), or {stopping}"
     if phase.status is Status.MAX_STEPS:
         return phase.detail, None
     possible = f"a motion of {fastest:.3g} s or longer exists"
@@ -170,9 +175,7 @@ def _explain_motion(
     if search.limits_rates:
         return f"{possible} where torques may jump", f"allow faster torques (--rate-limit) or more time ({longer})"
     if stop is not None:
-        return f"{possible}, but at speed no torques led to it", (
-            f"stop before the change of formation (`arrive = \"rest\"` in phase '{stop}'), or try another --passing"
-        )
+        return f"{possible}, but at speed no torques led to it", f"{stopping}, or try another --passing"
     return f"{possible}, but {search.knots} knots did not lead to it", (
         f"take more knots (--knots {max(MIN_KNOTS, 2 * search.knots)})"
     )
@@ -200,8 +203,8 @@ def _shorter_durations(
 
 
 def _first_half(phase: PhaseResult) -> str:
-    """Return what a status means: its advice as far as the remedy."""
-    return phase.status.advice.partition(";")[0]
+    """Return what a status means: its advice as far as the remedy; of an impact that opens a contact, the remedy."""
+    return OPENING_ADVICE if phase.is_opened_at_its_beginning else phase.status.advice.partition(";")[0]
 
 
 def round_up_digits(value: float, significant: int = 2) -> float:

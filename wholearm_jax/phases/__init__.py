@@ -58,7 +58,7 @@ from wholearm_jax.phases.plan_simulation import (
 )
 from wholearm_jax.phases.plan_tracing import trace, trace_paths_in_one_program
 from wholearm_jax.phases.rest_certificate import certify_rest
-from wholearm_jax.phases.result import PhaseResult, Result, build_result, rest_intervals
+from wholearm_jax.phases.result import OPENING_ADVICE, PhaseResult, Result, build_result, rest_intervals
 from wholearm_jax.phases.sampling import DEFAULT_SAMPLES, Trajectory, by_contact, sample_phase, trajectory
 from wholearm_jax.phases.standing_fingers import idle_torques
 from wholearm_jax.phases.torque_accuracy import END_ANGLE, END_POSITION, MOTOR_ERROR, required_accuracy, torque_accuracy

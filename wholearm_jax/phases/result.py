@@ -70,15 +70,20 @@ class PhaseResult:
             return f"{self.name}: ok, {least}{self._opening_note}"
         whose = f" at {self.contact}" if self.contact else ""
         advice = self.remedy or (SLIP_TOL if self.slips else self.status.advice)
-        if self.status is Status.CONTACT_LOST and self.opened == self.contact and self.time == self.start:
+        if self.is_opened_at_its_beginning:
             how_far = f"by {1e6 * self.opening:.2g} micrometres" if np.isfinite(self.opening) else "for good"
-            advice = f"the impact at its beginning opens it {how_far}; {OPENING_ADVICE}"
+            advice = f"the impact at its beginning opens it {how_far}; {self.remedy or OPENING_ADVICE}"
         if self.detail:
             advice = f"{self.detail}; {advice}"
         rests = self.status is Status.STUCK and self.holds
         since = f", at rest since {self.holds[-1].start:.6g} s" if rests else ""
         when = f", t = {self.time:.6g} s" if np.isfinite(self.time) else ""
         return f"{self.name}: {self.status.label}{whose}{when}{since}: {advice}"
+
+    @property
+    def is_opened_at_its_beginning(self) -> bool:
+        """Whether the phase fails because an impact opens a contact, entered at such a speed."""
+        return self.status is Status.CONTACT_LOST and self.opened == self.contact and self.time == self.start
 
     @property
     def _opening_note(self) -> str:
