@@ -31,36 +31,28 @@ def _weight(scene: wa.Scene) -> float:
     return float(scene.object.mass * np.linalg.norm(np.asarray(scene.gravity)))
 
 
-def _margins_along(scene: wa.Scene, move: Move, at: np.ndarray) -> np.ndarray:
-    """Compute the margins of a move's formation at numbers of its places, with the sign of its motion there."""
-    rows = contact_rows(scene, move.places, [feature_pair(name) for name in move.contacts]).between(at)
-    numbers = contact_numbers(rows, [move.contacts])
-    tangents = path_tangents(rows, numbers, sum(name != feature_pair(name) for name in move.contacts))
+def _margin_at(scene: wa.Scene, move: Move, place: int) -> float:
+    """Compute the margin of a move's formation at one of its places, with the sign of its motion there."""
+    rows = contact_rows(scene, move.places[place], [feature_pair(name) for name in move.contacts])
+    tangents = path_tangents(
+        rows, contact_numbers(rows, [move.contacts]), sum(name != feature_pair(name) for name in move.contacts)
+    )
     radii = np.array([*2 * [np.linalg.norm(np.asarray(scene.object.vertices), axis=1).max()], 1, 1, 1])
-    forward = (move.places[1] - move.places[0]) / radii @ tangents.direction[0, 0] > 0
-    return rest_margins(rows, tangents, 1 if forward else -1)[:, 0]
+    begin = min(place, len(move.places) - 2)
+    forward = (move.places[begin + 1] - move.places[begin]) / radii @ tangents.direction[0] > 0
+    return float(rest_margins(rows, tangents, 1 if forward else -1)[0])
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_margins_at_rest_are_those_of_the_traced_path(name):
     """At every place of every path; but for a few, where a slip reverses between that place and the table's panel."""
     scene, _, moves = _moves(name)
-    places = np.arange(len(moves[0].places), dtype=float)
     for move in moves:
-        margins = _margins_along(scene, move, places)
+        margins = np.array([_margin_at(scene, move, place) for place in range(len(move.places))])
         known = np.isfinite(margins)
-        assert known.sum() >= len(places) // 2
+        assert known.sum() >= len(margins) // 2
         agree = np.isclose(margins[known], move.margins[known], rtol=1e-3, atol=1e-3 * _weight(scene))
         assert agree.mean() > 0.9, move
-
-
-def test_margins_between_places_lie_between_theirs():
-    scene, _, moves = _moves("heptagon")
-    move = max(moves, key=lambda move: move.margins.min())
-    middle = _margins_along(scene, move, np.arange(len(move.places) - 1) + 0.5)
-    low, high = np.minimum(move.margins[:-1], move.margins[1:]), np.maximum(move.margins[:-1], move.margins[1:])
-    smooth = 0.01 * np.ptp(move.margins)
-    assert ((low - smooth < middle) & (middle < high + smooth)).mean() > 0.9
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -75,7 +67,7 @@ def test_moves_above_a_floor_are_those_whose_margin_exceeds_it(name, share):
     held = [move.margins[0] for move in moves if move.margins[0] > least]
     floor = least if share is None else float(np.quantile(held, share))
     above = {_key(move) for move in moves if move.margins[0] > floor}
-    unknown = {_key(move) for move in moves if _margins_along(scene, move, np.zeros(1))[0] == np.inf}
+    unknown = {_key(move) for move in moves if _margin_at(scene, move, 0) == np.inf}
     assert 0 < len(above) < len(moves)
     assert above <= {_key(move) for move in moves_from(scene, z, floor=floor)} <= above | unknown
     assert len(unknown) < len(moves) / 4

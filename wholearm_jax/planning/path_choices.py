@@ -61,14 +61,14 @@ def path_choices(
     combinations = tuple(names for names in formation_names([*contacts, *away], rolling) if _is_possible(names))
     if not combinations:
         return
-    rows = contact_rows(scene, np.asarray(z)[None], contacts, away)
+    rows = contact_rows(scene, z, contacts, away)
     for rolls, group in itertools.groupby(combinations, key=_rolling_count):
         chosen = tuple(group)
         tangents = path_tangents(rows, contact_numbers(rows, chosen), rolls)
-        margins = [rest_margins(rows, tangents, way)[0] for way in (-1, 1)] if floor > -np.inf else None
+        margins = [rest_margins(rows, tangents, way) for way in (-1, 1)] if floor > -np.inf else None
         for k, names in enumerate(chosen):
-            numbers, direction = tangents.number[k], tangents.direction[0, k]
-            if not tangents.is_path[0, k] or rows.same_tip[np.ix_(numbers, numbers)].any():
+            numbers, direction = tangents.number[k], tangents.direction[k]
+            if not tangents.is_path[k] or rows.same_tip[np.ix_(numbers, numbers)].any():
                 continue
             steepest = int(np.argmax(np.abs(direction)))
             for sign, way in (("-", 0), ("+", 1)):

@@ -1,9 +1,9 @@
-r"""Margins at rest of all formations of some contacts, at many places: which of them may begin there?
+"""Margins at rest of all formations of some contacts at a configuration: which of them may begin there?
 
 At rest the forces of a formation, slipping by its path, balance the weight, the joints' friction and the torques: five
 equations for six unknowns, four forces and two torques. The least slack is concave in the one that is left, so that its
-maximum lies where two slacks meet or at a limit (as in `best_quasistatic_torque`, which takes one place of a tabulated
-path; here many places of many formations, none of them traced). Derivation: section 8 of `docs/derivation.md`.
+maximum lies where two slacks meet or at a limit (as in `best_quasistatic_torque`, which takes a place of a tabulated
+path; here many formations, none of them traced). Derivation: section 8 of `docs/derivation.md`.
 """
 
 from typing import NamedTuple
@@ -22,21 +22,19 @@ class Tangents(NamedTuple):
 
     number: Int[np.ndarray, "formations contacts"]  # of each contact among the rows; those that roll come first
     rolling: int
-    direction: Float[np.ndarray, "places formations 5"]  # of a continuous sign along the places
-    is_path: Bool[np.ndarray, "places formations"]  # whether the constraints are independent
+    direction: Float[np.ndarray, "formations 5"]
+    is_path: Bool[np.ndarray, "formations"]  # whether the constraints are independent
 
 
 def path_tangents(rows: ContactRows, number: Int[np.ndarray, "formations contacts"], rolling: int) -> Tangents:
     """Compute the null vectors of formations' four constraints."""
-    normal, slip = rows.normal[:, number], rows.tangential[:, number[:, :rolling]]
-    _, values, right = np.linalg.svd(np.concatenate([normal, slip], axis=-2))
-    direction = right[..., 4, :]
-    turned = (direction[1:] * direction[:-1]).sum(-1, keepdims=True) < 0
-    direction[1:] *= np.cumprod(np.where(turned, -1.0, 1.0), axis=0)
-    return Tangents(number, rolling, direction, values[..., -1] > WEDGING_CONDITION * values[..., 0])
+    _, values, right = np.linalg.svd(
+        np.concatenate([rows.normal[number], rows.tangential[number[:, :rolling]]], axis=1)
+    )
+    return Tangents(number, rolling, right[:, 4], values[:, -1] > WEDGING_CONDITION * values[:, 0])
 
 
-def rest_margins(rows: ContactRows, tangents: Tangents, way: int) -> Float[np.ndarray, "places formations"]:
+def rest_margins(rows: ContactRows, tangents: Tangents, way: int) -> Float[np.ndarray, "formations"]:
     """Compute the largest margins [N] at rest of formations whose friction is that of setting out along their paths.
 
     Args:
@@ -50,28 +48,28 @@ def rest_margins(rows: ContactRows, tangents: Tangents, way: int) -> Float[np.nd
         its friction will have is not known there.
     """
     number, rolling, direction, is_path = tangents
-    normal, tangential = rows.normal[:, number], rows.tangential[:, number]
-    slip = (tangential[..., rolling:, :] @ direction[..., None])[..., 0]
-    friction = rows.friction[number]
+    normal, tangential, friction = rows.normal[number], rows.tangential[number], rows.friction[number]
+    slip = (tangential[:, rolling:] @ direction[..., None])[..., 0]
     # Unknowns, a row each: forces c_n, then c_t of contacts that roll, then torques.
-    drag = friction[:, rolling:, None] * way * _sign(slip)[..., None] * tangential[..., rolling:, :]
-    sliding = normal[..., rolling:, :] - drag
-    torques = np.broadcast_to(np.eye(5)[3:], (*direction.shape[:2], 2, 5))
-    wrench = np.concatenate([normal[..., :rolling, :], sliding, tangential[..., :rolling, :], torques], axis=-2)
+    drag = (friction[:, rolling:] * way * _sign(slip))[..., None] * tangential[:, rolling:]
+    torques = np.broadcast_to(np.eye(5)[3:], (len(number), 2, 5))
+    forces = normal[:, :rolling], normal[:, rolling:] - drag, tangential[:, :rolling]
+    wrench = np.concatenate([*forces, torques], axis=1)
     load = np.broadcast_to(rows.weight, direction.shape).copy()
-    load[..., 3:] -= way * _sign(direction[..., 3:]) * rows.dry
+    load[:, 3:] -= way * _sign(direction[:, 3:]) * rows.dry
 
-    left, values, right = np.linalg.svd(np.swapaxes(wrench, -1, -2))
-    balanced = values[..., -1] > WEDGING_CONDITION * values[..., 0]
-    share = (np.swapaxes(left, -1, -2) @ load[..., None])[..., 0] / np.where(balanced[..., None], values, 1.0)
-    base = -(np.swapaxes(right[..., :5, :], -1, -2) @ share[..., None])[..., 0]
-    margin = _best(base, right[..., 5, :], friction[:, :rolling], rows.torque_limit) * rows.force_unit
+    # One solution, and the direction in which there are others.
+    left, values, right = np.linalg.svd(np.swapaxes(wrench, 1, 2))
+    balanced = values[:, -1] > WEDGING_CONDITION * values[:, 0]
+    share = (np.swapaxes(left, 1, 2) @ load[..., None])[..., 0] / np.where(balanced[:, None], values, 1.0)
+    base = -(np.swapaxes(right[:, :5], 1, 2) @ share[..., None])[..., 0]
+    margin = _best(base, right[:, 5], friction[:, :rolling], rows.torque_limit) * rows.force_unit
 
-    unknown = ((_sign(slip) == 0) & (friction[:, rolling:] > 0)).any(-1)
-    unknown |= ((_sign(direction[..., 3:]) == 0) & (rows.dry > 0)).any(-1)
-    unknown &= (_sign(direction[..., :3]) != 0).any(-1)  # with an object at rest, what is still remains so
-    away = (rows.clearance[0, number] == np.inf).any(-1)
-    return np.where(is_path & balanced, np.where(unknown | away, np.inf, margin), -np.inf)
+    unknown = ((_sign(slip) == 0) & (friction[:, rolling:] > 0)).any(1)
+    unknown |= ((_sign(direction[:, 3:]) == 0) & (rows.dry > 0)).any(1)
+    unknown &= (_sign(direction[:, :3]) != 0).any(1)  # with an object at rest, what is still remains so
+    known = np.where(unknown | rows.is_away[number].any(1), np.inf, margin)
+    return np.where(is_path & balanced, known, -np.inf)
 
 
 def _sign(values: np.ndarray) -> np.ndarray:
