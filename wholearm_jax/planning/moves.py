@@ -181,6 +181,7 @@ def _trace_moves(body, hand, gravity, formations, targets, z, count) -> _Paths:
         found = one(jax.tree.map(lambda rows: rows[k], (formations, targets)))
         return jax.tree.map(lambda rows, row: rows.at[k].set(row), paths, found)
 
-    moves = formations, targets
-    none = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(lambda: jax.lax.map(one, moves)))
+    number, integers = jnp.zeros(MOVES_PER_CALL, z.dtype), jnp.zeros(MOVES_PER_CALL, int)
+    places, margins = (jnp.zeros((MOVES_PER_CALL, PLACES, *row), z.dtype) for row in ((5,), ()))
+    none = _Paths(integers, number, number, places, margins, integers, integers, integers)
     return jax.lax.fori_loop(0, count, next_one, none)
