@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from wholearm_jax.core import Status, require_positive
 from wholearm_jax.feedback.controller import Controller, PhaseLaw
-from wholearm_jax.feedback.either_formation import find_takeovers, with_either_formation
+from wholearm_jax.feedback.either_formation import UNSURE, find_takeovers, with_either_formation, with_hand_overs_judged
 from wholearm_jax.feedback.law_tables import law_tables
 from wholearm_jax.feedback.path_table import (
     PathTable,
@@ -141,7 +141,8 @@ def feedback(
         _terms_of_set(table, [paths[k] for paths in traces], [paths[k] for paths in held if has_paths(paths[: k + 1])])
         for k, table in enumerate(tables)
     ]
-    either = with_either_formation(tables, terms, find_takeovers(scene, traces[0]))
+    takeovers = find_takeovers(scene, traces[0])
+    either = with_either_formation(tables, terms, takeovers)
     limit, units = RESERVE * np.asarray(scene.hand.torque_limit), cost_units(scene)
     parts = [Part(*each, is_held=True, has_other_shape=False) for each in zip(scenes, traces, strict=True)]
     parts += [Part(*each, is_held=bool(held), has_other_shape=True) for each in zip(shapes, drawn, strict=True)]
@@ -153,7 +154,8 @@ def feedback(
         ]
         best = max(range(len(choices)), key=lambda option: _worst_first(choices[option]))
         for k, motion, choice in zip(group, options[best], choices[best], strict=True):
-            laws.append(_phase_law(scene, k, tables[k], terms[k][0], motion, choice, approaches[k], parts))
+            sure = UNSURE if k > 0 and takeovers[k - 1] else 0.0
+            laws.append(_phase_law(scene, k, tables[k], terms[k][0], motion, choice, approaches[k], parts, sure))
     slow = slowness(scene)
     first, *others = [defaults | given for defaults in _default_rates(scene, tables)]
     controller = Controller(
@@ -165,11 +167,11 @@ def feedback(
         patience=LONGEST_DELAY * slow,
         torque_limit=np.asarray(scene.hand.torque_limit),
     )
-    held = _with_simulated_margins(controller, parts)
+    held = _with_simulated_margins(with_hand_overs_judged(controller, either, takeovers), parts)
     for faster in others if held.margin <= 0 else ():
         if faster != first:  # not all rates are given
-            another = _with_simulated_margins(replace(controller, **faster), parts)
-            held = max(held, another, key=lambda one: one.margin)
+            another = with_hand_overs_judged(replace(controller, **faster), either, takeovers)
+            held = max(held, _with_simulated_margins(another, parts), key=lambda one: one.margin)
     return held
 
 
@@ -335,13 +337,18 @@ def _phase_law(
     choice: TorqueChoice,
     approach: Approach | None,
     parts: list[Part],
+    sure: float,
 ) -> PhaseLaw:
-    """Put the law of phase `k` together, for the nominal object's `terms` and the stops of all parts with paths."""
+    """Put the law of phase `k` together, for the nominal object's `terms` and the stops of all parts with paths.
+
+    A stop's own feedback begins beyond the place `sure`: up to there, that of the choice moves the object under either
+    formation of a hand-over.
+    """
     phase = scene.phases[k]
     gain = np.stack([np.interp(table.s, motion.s, choice.gain[:, j]) for j in range(2)], axis=1)
     flows, margin = phase.arrive is Arrival.MOVING, float(choice.margin.min())
     press, speed = 0.0, APPROACH / slowness(scene)
-    reach = approach.reach if approach is not None else 0.0
+    reach = min(approach.reach, float(table.s[-1]) - sure) if approach is not None else 0.0
     if approach is not None and not flows:
         speed = approach.speed
         press, gain_at_stop, held = _push_at_stop(scene, k, parts, choice.torque[-1], speed)
