@@ -142,6 +142,17 @@ def test_a_controller_of_another_plan_is_refused(controller):
         execute(wa.simulate(other, wa.quasistatic(other)), controller=controller)
 
 
+def test_rates_that_are_whole_numbers_are_those_rates(scene):
+    """In Python, and in a file, where 60 stands for 60.0."""
+    rates = {"stiffness": 60, "integral": 10, "observer": 200}
+    whole = wa.feedback(scene, wa.quasistatic(scene), friction=0.1, **rates)
+    given = wa.feedback(
+        scene, wa.quasistatic(scene), friction=0.1, **{name: float(rate) for name, rate in rates.items()}
+    )
+    assert all(phase.margin > 0 for phase in given.phases)
+    assert [phase.margin for phase in whole.phases] == [phase.margin for phase in given.phases]
+
+
 def test_a_path_on_which_the_joints_stand_still_has_no_law(tmp_path, wholearm):
     """A triangle turns about its vertex on the palm, held by finger 1 alone: where that is perpendicular to the line
     from there to the vertex that it holds, it turns back."""

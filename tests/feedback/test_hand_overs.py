@@ -1,5 +1,7 @@
 """Laws where a vertex and a fingertip take over from one another: nothing stops the object there."""
 
+from pathlib import Path
+
 import equinox as eqx
 import mujoco
 import numpy as np
@@ -11,9 +13,12 @@ from wholearm_jax.execution.acting_pairs import choose_pairs
 from wholearm_jax.execution.executions import execute
 from wholearm_jax.execution.mujoco_model import build_mujoco_model
 from wholearm_jax.feedback import feedback
+from wholearm_jax.feedback.either_formation import UNSURE
 from wholearm_jax.feedback.path_table import path_terms, tabulate_path
 from wholearm_jax.model import rigid_body
 from wholearm_jax.phases import ends_at_stop
+
+DATA = Path(__file__).parents[1] / "data"
 
 
 @pytest.fixture(scope="module")
@@ -156,3 +161,24 @@ def test_a_motion_that_is_slow_at_a_hand_over_has_the_rates_of_a_faster_one(shor
     done = execute(short_path.result, timestep=2e-4, controller=law)
     assert done.ending.value == "ok"
     assert done.position_error < 5e-4
+
+
+def test_a_law_that_may_not_get_away_from_a_hand_over_is_refused():
+    """The stop is so near that the feedback is small from the pivot's begin on: next to the hand-over it does not move
+    the object as the contact holds it that the slide ends with. Executed, it stands still there."""
+    scene = wa.load(DATA / "hand_over_near_stop.toml")
+    optimum = wa.optimise(scene)
+    assert optimum.result.status is wa.Status.OK
+    law = feedback(scene, optimum.torque, friction=0.1, stiffness=60.0, integral=10.0, observer=200.0)
+    slide, pivot = law.phases
+    assert slide.margin > 0.4
+    assert pivot.margin == -np.inf
+    done = execute(optimum.result, timestep=5e-4, controller=law)
+    assert done.ending.value == "astray"
+    assert done.position_error > 1e-3
+    # No farther than to where the stop's feedback begins is the gain that which moves it under either formation.
+    assert pivot.reach == pytest.approx(pivot.s[-1] - UNSURE)
+    before = path_terms(
+        optimum.result.phases[0].traced.dynamics, tabulate_path(optimum.result.phases[0].traced.dynamics)
+    )
+    assert before.acceleration[-1, 3:] @ pivot.gain[0] > 0

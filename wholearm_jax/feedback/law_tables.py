@@ -35,10 +35,11 @@ def law_tables(controller: Controller) -> LawTables:
         **{name: over_time(name) for name in ("time", "s_ref", "v_ref", "torque")},
         **{name: numbers(name) for name in ("length", "flows", "reach", "approach", "press")},
     )
-    constants = {name: getattr(controller, name) for name in ("stiffness", "integral", "observer", "push", "patience")}
+    names = "stiffness", "integral", "observer", "push", "patience"
+    constants = {name: float(getattr(controller, name)) for name in names}  # a whole number may be an integer
     return LawTables(
         phases=tables,
-        settle=as_device_array(controller.felt[1]),
+        settle=as_device_array(float(controller.felt[1])),
         torque_limit=as_device_array(controller.torque_limit),
         **{name: as_device_array(value) for name, value in constants.items()},
     )
