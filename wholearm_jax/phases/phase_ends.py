@@ -65,27 +65,21 @@ def _start_accelerations(dynamics: PathDynamics) -> tuple[Float[Array, "5"], Flo
 
 
 def formation_at_end(scene: Scene, phase: Phase, traced: TracedPhase) -> ContactFormation:
-    """Return a phase's formation with the contact that ends its path."""
-    link, kind, feature = _end_contact(scene, traced)
+    """Return a phase's formation with the contact that ends its path, a corner of a link on an edge included."""
+    group, feature = divmod(int(traced.path.end_contact), scene.object.vertices.shape[0])
+    link, kind = FEATURE_GROUPS[group]
     held = phase.formation
     rows = zip((held.link, held.kind, held.feature, held.tangential), (link, kind, feature, False), strict=True)
     return ContactFormation(*(jnp.append(column, value) for column, value in rows))
-
-
-def _end_contact(scene: Scene, traced: TracedPhase) -> tuple[int, int, int]:
-    """Return link, kind and feature of the contact that ends a path."""
-    group, feature = divmod(int(traced.path.end_contact), scene.object.vertices.shape[0])
-    return *FEATURE_GROUPS[group], feature
 
 
 def ends_at_stop(scene: Scene, phase: Phase, traced: TracedPhase) -> bool:
     """Return whether a new contact stops the object at the end of a phase's path.
 
     None does where the path ends because a vertex and a fingertip take over from one another: there the object can go
-    on under the new contact. Nor is an edge pressed against a corner of a link, a finger's root or an end of the palm:
-    no formation holds an object there.
+    on under the new contact.
     """
-    if int(traced.path.end_reason) != PathEnd.CONTACT_MADE or _end_contact(scene, traced)[1] in (FINGER_ROOT, PALM_END):
+    if int(traced.path.end_reason) != PathEnd.CONTACT_MADE:
         return False
     closed = formation_at_end(scene, phase, traced)
     return not bool(_takes_over(scene.object, scene.hand, scene.gravity, closed, traced.end))
@@ -105,7 +99,8 @@ def describe_end(scene: Scene, phase: Phase, traced: TracedPhase) -> str:
         return "the object is held"
     reason, index = int(traced.path.end_reason), int(traced.path.end_contact)
     if reason == PathEnd.CONTACT_MADE:
-        link, kind, feature = _end_contact(scene, traced)
+        group, feature = divmod(index, scene.object.vertices.shape[0])
+        link, kind = FEATURE_GROUPS[group]
         if kind == FINGER_ROOT:
             return f"e{feature} meets finger{link}'s root"
         if kind == PALM_END:
