@@ -1,13 +1,14 @@
 """Parts of other shape meet their stops elsewhere: the law comes to them slowly, and goes on to those that are late."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import equinox as eqx
 import numpy as np
 import pytest
 
 import wholearm_jax as wa
-from wholearm_jax.execution import Amounts, run_trials
+from wholearm_jax.execution import Amounts, execute, run_trials
 from wholearm_jax.feedback import feedback, stop_torque
 from wholearm_jax.feedback.design import _default_rates, corner_scenes
 from wholearm_jax.feedback.path_table import tabulate_path
@@ -16,6 +17,7 @@ from wholearm_jax.feedback.stop_places import draw_shapes, stop_places
 from wholearm_jax.feedback.stop_torque import choose_push, object_at_stop
 from wholearm_jax.files.scene_toml import to_dict
 from wholearm_jax.model import object_radius, rigid_body
+from wholearm_jax.phases import describe_end
 
 SHAPE = 5e-4
 
@@ -302,3 +304,16 @@ def lever(scene, path, finger):
     along = np.array([np.cos(theta[finger - 1]), np.sin(theta[finger - 1])])
     touching = {1: (6,), 2: (1, 2)}[finger]
     return sum((corners[k] - np.asarray(scene.hand.joint)[finger - 1]) @ along for k in touching)
+
+
+def test_an_edge_is_not_pressed_against_a_fingers_root():
+    """A corner above the palm, at which no formation holds an object: the law comes there by itself, and stays."""
+    scene = wa.load(Path(__file__).parents[1] / "data" / "edge_at_root.toml")
+    optimum = wa.optimise(scene)
+    assert describe_end(scene, scene.phases[0], optimum.result.phases[0].traced) == "e1 meets finger1's root"
+    law = wa.feedback(scene, optimum.torque, friction=0.1)
+    assert law.phases[0].reach == 0
+    assert law.margin > 0
+    done = execute(optimum.result, timestep=5e-4, controller=law)
+    assert done.ending.value == "ok", done.message
+    assert done.position_error < 5e-4

@@ -65,21 +65,30 @@ def _start_accelerations(dynamics: PathDynamics) -> tuple[Float[Array, "5"], Flo
 
 
 def formation_at_end(scene: Scene, phase: Phase, traced: TracedPhase) -> ContactFormation:
-    """Return a phase's formation with the contact that ends its path, a corner of a link on an edge included."""
-    group, feature = divmod(int(traced.path.end_contact), scene.object.vertices.shape[0])
-    link, kind = FEATURE_GROUPS[group]
+    """Return a phase's formation with the contact that ends its path."""
+    link, kind, feature = _end_contact(scene, traced)
     held = phase.formation
     rows = zip((held.link, held.kind, held.feature, held.tangential), (link, kind, feature, False), strict=True)
     return ContactFormation(*(jnp.append(column, value) for column, value in rows))
+
+
+def _end_contact(scene: Scene, traced: TracedPhase) -> tuple[int, int, int]:
+    """Return link, kind and feature of the contact that ends a path."""
+    group, feature = divmod(int(traced.path.end_contact), scene.object.vertices.shape[0])
+    return *FEATURE_GROUPS[group], feature
 
 
 def ends_at_stop(scene: Scene, phase: Phase, traced: TracedPhase) -> bool:
     """Return whether a new contact stops the object at the end of a phase's path.
 
     None does where the path ends because a vertex and a fingertip take over from one another: there the object can go
-    on under the new contact.
+    on under the new contact. Nor is an edge pressed against the root of a finger whose contact edge stands apart from
+    its joint: a corner above the palm, at which no formation holds an object.
     """
     if int(traced.path.end_reason) != PathEnd.CONTACT_MADE:
+        return False
+    link, kind, _ = _end_contact(scene, traced)
+    if kind == FINGER_ROOT and float(scene.hand.offset[link - 1]) > 0:
         return False
     closed = formation_at_end(scene, phase, traced)
     return not bool(_takes_over(scene.object, scene.hand, scene.gravity, closed, traced.end))
@@ -99,8 +108,7 @@ def describe_end(scene: Scene, phase: Phase, traced: TracedPhase) -> str:
         return "the object is held"
     reason, index = int(traced.path.end_reason), int(traced.path.end_contact)
     if reason == PathEnd.CONTACT_MADE:
-        group, feature = divmod(index, scene.object.vertices.shape[0])
-        link, kind = FEATURE_GROUPS[group]
+        link, kind, feature = _end_contact(scene, traced)
         if kind == FINGER_ROOT:
             return f"e{feature} meets finger{link}'s root"
         if kind == PALM_END:
