@@ -52,7 +52,7 @@ def path_choices(
         contacts: names of the contacts to combine, as if none rolled.
         rolling: whether contacts may roll.
         away: fingers that may stand still without a contact, such as `finger1:away`.
-        floor: margin at rest [N] that a way along a path has to exceed where it begins; unless given, none has to.
+        floor: margin at rest [N] that a move has to exceed where it begins; unless given, none has to.
 
     Yields:
         The names of a formation's contacts and the direction as scene files write it, by the coordinate that changes
@@ -65,15 +65,15 @@ def path_choices(
     for rolls, group in itertools.groupby(combinations, key=_rolling_count):
         chosen = tuple(group)
         tangents = path_tangents(rows, contact_numbers(rows, chosen), rolls)
-        margins = [rest_margins(rows, tangents, way) for way in (-1, 1)] if floor > -np.inf else None
+        margins = {sense: rest_margins(rows, tangents, sense) for sense in (-1, 1)} if floor > -np.inf else None
         for k, names in enumerate(chosen):
             numbers, direction = tangents.number[k], tangents.direction[k]
             if not tangents.is_path[k] or rows.same_tip[np.ix_(numbers, numbers)].any():
                 continue
             steepest = int(np.argmax(np.abs(direction)))
-            for sign, way in (("-", 0), ("+", 1)):
-                along = way if direction[steepest] > 0 else 1 - way
-                if margins is None or margins[along][k] > floor:
+            forward = 1 if direction[steepest] > 0 else -1
+            for sign, sense in (("-", -forward), ("+", forward)):
+                if margins is None or margins[sense][k] > floor:
                     yield names, f"{COORDINATES[steepest]}{sign}"
 
 

@@ -34,13 +34,13 @@ def path_tangents(rows: ContactRows, number: Int[np.ndarray, "formations contact
     return Tangents(number, rolling, right[:, 4], values[:, -1] > WEDGING_CONDITION * values[:, 0])
 
 
-def rest_margins(rows: ContactRows, tangents: Tangents, way: int) -> Float[np.ndarray, "formations"]:
+def rest_margins(rows: ContactRows, tangents: Tangents, sense: int) -> Float[np.ndarray, "formations"]:
     """Compute the largest margins [N] at rest of formations whose friction is that of setting out along their paths.
 
     Args:
         rows: the contacts.
         tangents: the formations' paths.
-        way: 1 or -1, along their directions or against them.
+        sense: 1 or -1, along their directions or against them.
 
     Returns:
         The margins; minus infinity where no torques within limits hold the object, or constraints depend on each other.
@@ -51,12 +51,12 @@ def rest_margins(rows: ContactRows, tangents: Tangents, way: int) -> Float[np.nd
     normal, tangential, friction = rows.normal[number], rows.tangential[number], rows.friction[number]
     slip = (tangential[:, rolling:] @ direction[..., None])[..., 0]
     # Unknowns, a row each: forces c_n, then c_t of contacts that roll, then torques.
-    drag = (friction[:, rolling:] * way * _sign(slip))[..., None] * tangential[:, rolling:]
+    drag = (friction[:, rolling:] * sense * _sign(slip))[..., None] * tangential[:, rolling:]
     torques = np.broadcast_to(np.eye(5)[3:], (len(number), 2, 5))
     forces = normal[:, :rolling], normal[:, rolling:] - drag, tangential[:, :rolling]
     wrench = np.concatenate([*forces, torques], axis=1)
     load = np.broadcast_to(rows.weight, direction.shape).copy()
-    load[:, 3:] -= way * _sign(direction[:, 3:]) * rows.dry
+    load[:, 3:] -= sense * _sign(direction[:, 3:]) * rows.dry
 
     # One solution, and the direction in which there are others.
     left, values, right = np.linalg.svd(np.swapaxes(wrench, 1, 2))
