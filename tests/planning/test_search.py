@@ -272,6 +272,10 @@ def test_a_start_at_which_links_overlap_says_which(part):
     assert not found.found
     assert found.nodes == 0
     assert found.reason.startswith("no plan: at the start finger1 and finger2 cross, ")
+    assert found.reason.endswith("layered)")
+    layered = eqx.tree_at(lambda h: h.layered, hand, jnp.array(True))  # what it advises helps: no finger is in the way
+    other = wa.plan(eqx.tree_at(lambda s: (s.hand, s.start), part, (layered, jnp.asarray(z))), by={"x": -0.01})
+    assert other.nodes > 0
 
 
 def test_a_floor_for_the_margin_holds(part):

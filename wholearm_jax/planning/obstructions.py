@@ -34,6 +34,19 @@ def explain_failure(goal: Goal, z: np.ndarray, moves: Sequence[Move], floor: flo
     return f"no plan: {limit}; nearest: {', '.join(missing) or 'at the goal'}; there {'; '.join(lines)}"
 
 
+def explain_overlaps(overlaps: Sequence[str]) -> str:
+    """Say what overlaps at the start of a search, and what helps; nothing where nothing does.
+
+    Args:
+        overlaps: what `describe_overlaps` says of the start.
+    """
+    if not overlaps:
+        return ""
+    cross = any("cross" in line for line in overlaps)
+    advice = "search for a hand that fits, as with --hand-from, or let its fingers pass each other (layered)"
+    return f"at the start {'; '.join(overlaps)}: {advice if cross else 'correct its pose and angles'}"
+
+
 def explain_far_goal(goal: Goal, hand: Hand) -> str:
     """Say that a goal is so far off that its unit must be another one; nothing where it may be meant."""
     far = FAR * float((abs(hand.joint).max(1) + hand.length).max())
