@@ -1,5 +1,6 @@
 """Plans from a start and a goal: traced anew, they arrive; where there is none, the reason is right."""
 
+import importlib
 import itertools
 import json
 from dataclasses import replace
@@ -18,6 +19,7 @@ from wholearm_jax.files.scene_toml import SceneError, to_dict
 from wholearm_jax.model import COORDINATES, resting_configuration
 from wholearm_jax.planning.goal import make_goal
 from wholearm_jax.planning.improvement import is_secure
+from wholearm_jax.planning.move_stops import move_stops
 from wholearm_jax.planning.moves import moves_from
 from wholearm_jax.planning.plans import make_plan
 from wholearm_jax.planning.search import SHORT_PLAN
@@ -233,11 +235,19 @@ def test_a_part_that_can_be_tipped_from_a_small_part_of_a_slide_only_is():
     assert float(traced[-1].end[2] - z[2]) == pytest.approx(np.radians(-15), abs=np.radians(1))
 
 
-def test_what_has_been_found_when_the_search_ends_is_judged(part):
-    """The twelfth configuration's moves reach the goal; two more would be expanded before it had its turn."""
-    found = wa.plan(part, by={"phi": -0.1}, count=1, max_nodes=12)
-    assert found.nodes == 12
+def test_what_has_been_found_when_the_search_ends_is_judged(part, monkeypatch):
+    """The first configuration's moves reach the goal, but other places are to be looked at before it has its turn."""
+    module = importlib.import_module("wholearm_jax.planning.search")
+
+    def late(move, goal, unit):
+        for step, is_end in move_stops(move, goal, unit):
+            yield replace(step, delay=9.0 if goal.is_reached(step.end) else step.delay), is_end
+
+    monkeypatch.setattr(module, "move_stops", late)
+    found = wa.plan(part, by={"x": 0.01}, count=1, max_nodes=1)
+    assert found.nodes == 1
     assert found.found
+    assert found.plans[0].ends[-1][0] == pytest.approx(float(part.start[0]) + 0.01, abs=1e-3)
 
 
 def test_an_unreachable_goal_names_the_nearest_pose(part):

@@ -6,6 +6,7 @@ given vertices.
 """
 
 import enum
+import functools
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -248,6 +249,7 @@ def path_target(toward: str | None, until: Mapping[Any, float] | None = None) ->
     )
 
 
+@functools.lru_cache(maxsize=4096)
 def parse_contact(text: str) -> tuple[int, int, int, bool]:
     """`"finger2:e3 rolling"` -> (link, kind, feature, rolling); `"finger1:away"` -> (1, AWAY, 0, False).
 

@@ -21,7 +21,7 @@ from wholearm_jax.model import (
     scaled_mechanics,
     tangential_jacobian,
 )
-from wholearm_jax.tracing import hold_same_tip
+from wholearm_jax.tracing import feature_clearance, hold_same_tip
 
 ROWS_STEP = 8  # contacts whose rows one program computes; their number is rounded up to a multiple
 
@@ -37,6 +37,7 @@ class ContactRows(NamedTuple):
     normal: Float[np.ndarray, "contacts 5"]  # gradients of the gaps, `G_n`
     tangential: Float[np.ndarray, "contacts 5"]  # `G_t`
     same_tip: Bool[np.ndarray, "contacts contacts"]  # which two hold a fingertip at a vertex
+    clearance: Float[np.ndarray, "contacts"]  # from the nearer end of a contact's feature
     friction: Float[np.ndarray, "contacts"]
     weight: Float[np.ndarray, "5"]
     dry: Float[np.ndarray, "2"]  # friction of the joints
@@ -58,7 +59,7 @@ def contact_rows(
     # As if all slid: one program for up to `ROWS_STEP` contacts.
     every = formation_in_numpy((*contacts, *[contacts[0]] * (-len(contacts) % ROWS_STEP)))
     at_z = _rows_at(rigid_body(scene.object), scene.hand, scene.gravity, every, np.asarray(z))
-    normal, tangential, same_tip, friction, *loads = jax.device_get(at_z)
+    normal, tangential, same_tip, clearance, friction, *loads = jax.device_get(at_z)
     count, more = len(contacts), len(away)
     held = np.eye(5)[[3 + AWAY_NAMES.index(name) for name in away]]
     return ContactRows(
@@ -67,6 +68,7 @@ def contact_rows(
         np.concatenate([normal[:count], held]),
         np.concatenate([tangential[:count], 0 * held]),
         np.pad(same_tip[:count, :count], (0, more)),
+        np.append(clearance[:count], np.zeros(more)),
         np.append(friction[:count], np.zeros(more)),
         *loads,
     )
@@ -81,4 +83,5 @@ def _rows_at(body, hand, gravity, formation, z):
     weight = jnp.pad(mechanics.inertia[0] * mechanics.gravity, (0, 3))
     limit = mechanics.torque_limit / mechanics.torque_unit
     loads = weight, mechanics.dry, limit, mechanics.force_unit
-    return *rows, hold_same_tip(contacts, at, contacts, at), contacts.friction, *loads
+    tips = hold_same_tip(contacts, at, contacts, at)
+    return *rows, tips, feature_clearance(contacts, at), contacts.friction, *loads

@@ -1,5 +1,6 @@
 """Goals of a plan: the coordinates that matter, with tolerances."""
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -19,13 +20,24 @@ class Goal:
 
     def distance(self, z) -> np.ndarray:
         """Return the distance of configurations `(..., 5)` from the goal in each of its coordinates (..., goals)."""
-        rows = [COORDINATES.index(name) for name in self.values]
-        return np.abs(np.asarray(z)[..., rows] - np.array([*self.values.values()]))
+        return np.abs(np.asarray(z)[..., self._rows] - self._aims)
 
     def is_reached(self, z) -> bool:
         """Whether a configuration is within all tolerances."""
-        limits = np.array([self.tolerance[name] for name in self.values])
-        return bool(np.all(self.distance(z) <= limits))
+        return bool((self.distance(z) <= self.limits).all())
+
+    @functools.cached_property
+    def limits(self) -> np.ndarray:
+        """The tolerances of its coordinates, in their order."""
+        return np.array([self.tolerance[name] for name in self.values])
+
+    @functools.cached_property
+    def _aims(self) -> np.ndarray:
+        return np.array([*self.values.values()])
+
+    @functools.cached_property
+    def _rows(self) -> np.ndarray:
+        return np.array([COORDINATES.index(name) for name in self.values])
 
 
 def make_goal(

@@ -4,13 +4,15 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.margin import MAX_ROLLING
 from wholearm_jax.model import AWAY_NAMES, COORDINATES, Scene, feature_pair
 from wholearm_jax.planning.contact_rows import ContactRows, contact_rows
-from wholearm_jax.planning.rest_margins import path_tangents, rest_margins
+from wholearm_jax.planning.rest_margins import Tangents, both_senses, path_tangents, rest_margins
 
+WELL_INSIDE = 0.02  # distance of a contact from its feature's end, in object radii, within which it may slip off there
+CLOSING_RATE = 1e-3  # of a gap, for a unit step along a path, above which a contact that touches already ends the path
 PathChoice = tuple[tuple[str, ...], str]  # names of a formation's contacts, and the direction as scene files write it
 
 
@@ -52,7 +54,8 @@ def path_choices(
         contacts: names of the contacts to combine, as if none rolled.
         rolling: whether contacts may roll.
         away: fingers that may stand still without a contact, such as `finger1:away`.
-        floor: margin at rest [N] that a move has to exceed where it begins; unless given, none has to.
+        floor: margin at rest [N] that a move has to exceed where it begins, with every other contact free to part
+            there; unless given, none has to.
 
     Yields:
         The names of a formation's contacts and the direction as scene files write it, by the coordinate that changes
@@ -64,17 +67,32 @@ def path_choices(
     rows = contact_rows(scene, z, contacts, away)
     for rolls, group in itertools.groupby(combinations, key=_rolling_count):
         chosen = tuple(group)
-        tangents = path_tangents(rows, contact_numbers(rows, chosen), rolls)
-        margins = {sense: rest_margins(rows, tangents, sense) for sense in (-1, 1)} if floor > -np.inf else None
+        tangents = both_senses(path_tangents(rows, contact_numbers(rows, chosen), rolls))
+        begins = _may_begin(rows, tangents, floor)
         for k, names in enumerate(chosen):
-            numbers, direction = tangents.number[k], tangents.direction[k]
-            if not tangents.is_path[k] or rows.same_tip[np.ix_(numbers, numbers)].any():
-                continue
+            direction = tangents.direction[k]
             steepest = int(np.argmax(np.abs(direction)))
-            forward = 1 if direction[steepest] > 0 else -1
-            for sign, sense in (("-", -forward), ("+", forward)):
-                if margins is None or margins[sense][k] > floor:
+            ahead, back = (k, k + len(chosen)) if direction[steepest] > 0 else (k + len(chosen), k)
+            for sign, number in (("-", back), ("+", ahead)):
+                if begins[number]:
                     yield names, f"{COORDINATES[steepest]}{sign}"
+
+
+def _may_begin(rows: ContactRows, tangents: Tangents, floor: float) -> Bool[np.ndarray, "formations"]:
+    """Which paths begin: with a margin at rest above a floor [N], if there is one, and not stopped at once."""
+    number = tangents.number
+    begins = tangents.is_path & ~rows.same_tip[number[:, :, None], number[:, None, :]].any((1, 2))
+    if floor == -np.inf:
+        return begins
+    return begins & (rest_margins(rows, tangents) > floor) & ~_are_stopped(rows, tangents)
+
+
+def _are_stopped(rows: ContactRows, tangents: Tangents) -> Bool[np.ndarray, "formations"]:
+    """Which paths end where they begin: one of the other contacts is pressed on, away from its feature's ends."""
+    others = np.tile(rows.clearance > WELL_INSIDE, (len(tangents.number), 1))
+    np.put_along_axis(others, tangents.number, False, axis=1)
+    approach = -tangents.direction @ rows.normal.T
+    return np.any(others & (approach > CLOSING_RATE), axis=1)
 
 
 def _rolling_count(names: Sequence[str]) -> int:

@@ -34,13 +34,19 @@ def path_tangents(rows: ContactRows, number: Int[np.ndarray, "formations contact
     return Tangents(number, rolling, right[:, 4], values[:, -1] > WEDGING_CONDITION * values[:, 0])
 
 
-def rest_margins(rows: ContactRows, tangents: Tangents, sense: int) -> Float[np.ndarray, "formations"]:
+def both_senses(tangents: Tangents) -> Tangents:
+    """Append the same paths in the opposite directions."""
+    number, rolling, direction, is_path = tangents
+    twice = np.concatenate([number, number]), rolling, np.concatenate([direction, -direction])
+    return Tangents(*twice, np.concatenate([is_path, is_path]))
+
+
+def rest_margins(rows: ContactRows, tangents: Tangents) -> Float[np.ndarray, "formations"]:
     """Compute the largest margins [N] at rest of formations whose friction is that of setting out along their paths.
 
     Args:
         rows: the contacts.
-        tangents: the formations' paths.
-        sense: 1 or -1, along their directions or against them.
+        tangents: the formations' paths, in the directions in which they are to be followed.
 
     Returns:
         The margins; minus infinity where no torques within limits hold the object, or constraints depend on each other.
@@ -51,12 +57,12 @@ def rest_margins(rows: ContactRows, tangents: Tangents, sense: int) -> Float[np.
     normal, tangential, friction = rows.normal[number], rows.tangential[number], rows.friction[number]
     slip = (tangential[:, rolling:] @ direction[..., None])[..., 0]
     # Unknowns, a row each: forces c_n, then c_t of contacts that roll, then torques.
-    drag = (friction[:, rolling:] * sense * _sign(slip))[..., None] * tangential[:, rolling:]
+    drag = (friction[:, rolling:] * _sign(slip))[..., None] * tangential[:, rolling:]
     torques = np.broadcast_to(np.eye(5)[3:], (len(number), 2, 5))
     forces = normal[:, :rolling], normal[:, rolling:] - drag, tangential[:, :rolling]
     wrench = np.concatenate([*forces, torques], axis=1)
     load = np.broadcast_to(rows.weight, direction.shape).copy()
-    load[:, 3:] -= sense * _sign(direction[:, 3:]) * rows.dry
+    load[:, 3:] -= _sign(direction[:, 3:]) * rows.dry
 
     # One solution, and the direction in which there are others.
     left, values, right = np.linalg.svd(np.swapaxes(wrench, 1, 2))

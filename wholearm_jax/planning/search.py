@@ -301,8 +301,7 @@ def _phases_to_go(search: _Search, z: np.ndarray) -> float:
     """Estimate how many moves lead from a configuration to the goal; 0 within its tolerances."""
     shift = TYPICAL_SHIFT * search.unit[0]
     sizes = [TYPICAL_TURN if name in ANGLE_COORDINATES else shift for name in search.goal.values]
-    tolerances = np.array([search.goal.tolerance[name] for name in search.goal.values])
-    return float((np.maximum(search.goal.distance(z) - tolerances, 0.0) / sizes).sum())
+    return float((np.maximum(search.goal.distance(z) - search.goal.limits, 0.0) / sizes).sum())
 
 
 def _expand(search: _Search, z: np.ndarray, steps: tuple[Step, ...], touching) -> None:
