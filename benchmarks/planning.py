@@ -1,32 +1,36 @@
 """From a goal to a plan: the share of goals that is reached, how fast, and against a random search.
 
-    python benchmarks/planning.py [--objects 2] [--seconds 5] [--quick]
+    python benchmarks/planning.py [--objects 2] [--seconds 5] [--quick] [--rates]
 
 Objects are boxes, triangles, L shapes and random polygons, each at rest on an edge on those of three coplanar hands
 whose fingers close on it without crossing; goals are slides by 20 and 40 mm, turns by 15 to 90 degrees, and both. Every
 goal is planned for with rolling contacts, with regrasps besides, with sliding contacts alone, and by a random search (a
 rapidly exploring random tree over the same moves, as in contact-mode-guided planning: X. Cheng, E. Huang, Y. Hou and
 M. T. Mason, 2021), each for the same time. Prints and writes the shares (by goal on the best of the hands, too), the
-margins, the times of plans that were found, what stands in the way of others, and paths a second.
+margins, the times of plans that were found, what stands in the way of others, and moves a second; `--rates` measures
+paths a second alone: all moves where the bundled plans' phases begin, traced, and as a search looks at them.
 """
 
 import argparse
 import statistics
 import time
 from collections import Counter, defaultdict
+from functools import partial
 
 import equinox as eqx
 import matplotlib.pyplot as plt
 import numpy as np
-from measure import RESULTS, save
+from measure import RESULTS, compare, save
 from random_plans import random_object
 
 import wholearm_jax as wa
 from wholearm_jax.core import as_device_array
+from wholearm_jax.files import bundled
 from wholearm_jax.model import COORDINATES, object_radius, resting_configuration, rigid_body
 from wholearm_jax.phases import describe_overlaps
 from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.moves import moves_from
+from wholearm_jax.planning.path_choices import path_choices
 from wholearm_jax.planning.plans import Step, contact_left, make_plan
 from wholearm_jax.planning.successors import touching_contacts
 from wholearm_jax.plotting.palette import CONTACT_COLOURS
@@ -174,6 +178,28 @@ def measure(count: int, seconds: float, seed: int) -> dict:
     return {"rows": rows, "paths_a_second": paths / max(spent, 1e-9), "time_limit": seconds}
 
 
+def path_rates(repeats: int) -> list[dict]:
+    """Time all moves where the phases of the bundled plans begin: all traced, and those alone that a search traces."""
+    rows = []
+    for name in bundled():
+        scene = wa.load(name)
+        for phase, traced in zip(scene.phases, wa.trace(scene), strict=True):
+            touching = touching_contacts(scene, traced.begin)
+            moves = len([*path_choices(scene, traced.begin, touching, rolling=True)])
+            look = partial(moves_from, scene, traced.begin, touching)
+            times = compare({"traced": look, "judged": partial(look, floor=0.0)}, repeats=repeats)
+            rates = {f"{kind}_a_second": moves / time for kind, time in times.items()}
+            rows.append({"scene": name, "phase": phase.name, "moves": moves, **rates})
+    return rows
+
+
+def report_rates(rows: list[dict]) -> None:
+    """Print how many moves a second are traced, and judged as a search does: most before they are traced."""
+    for key, word in (("traced_a_second", "traced"), ("judged_a_second", "judged")):
+        rates = [row[key] for row in rows]
+        print(f"moves {word}: {statistics.median(rates):.0f} a second in the median, {min(rates):.0f} at least")
+
+
 def shares(rows: list[dict], key: str) -> dict[str, dict[str, float]]:
     """Share of goals that each planner reaches, by `key`."""
     groups: dict = defaultdict(lambda: defaultdict(list))
@@ -231,7 +257,7 @@ def report(found: dict) -> None:
     times = [row["seconds"] for row in by_planner["rolling"] if row["bound"]]
     if times:
         print(
-            f"plans found: {statistics.median(times):.2f} s in the median; {found['paths_a_second']:.0f} paths a second"
+            f"plans found: {statistics.median(times):.2f} s in the median; {found['paths_a_second']:.0f} moves a second"
         )
 
 
@@ -260,7 +286,14 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="for each goal and planner")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quick", action="store_true", help="one hand, two goals, half a second; nothing is written")
+    parser.add_argument("--rates", action="store_true", help="paths a second, nothing else")
     given = parser.parse_args()
+    if given.rates:
+        rows = path_rates(repeats=1 if given.quick else 25)
+        report_rates(rows)
+        if not given.quick:
+            save("planning_rates", {"rows": rows})
+        return
     if given.quick:
         for table, kept in ((HANDS, ["110 mm"]), (GOALS, ["slide 20 mm", "turn 15 deg"]), (FARTHER, [])):
             for name in {*table} - {*kept}:

@@ -22,7 +22,8 @@ RUNS = {  # what each runs, after `import NAME as module`
     "gradients": "module.KNOTS, module.TOLERANCES = (4,), (1e-4,); run('--quick')",
     "interruption": "run('--runs', '1', '--latest', '3')",
     "optimisation": "module.random_plans = lambda *_: (); run('--quick')",
-    "planning": "module.PLANNERS = {'rolling': {}, 'random tree': None}; run('--quick')",
+    "planning": "module.PLANNERS = {'rolling': {}, 'random tree': None}; run('--quick'); "
+    "module.bundled = lambda: ['tipping']; run('--quick', '--rates')",
     "plan_executions": "run('--quick')",
     "prediction": "module.SORTS, module.TIMESTEP = {'stopping': 1}, 4e-4; run('--quick', '--seeds', '0')",
     "random_plans": "run('--count', '1', '--phases', '1')",
