@@ -37,7 +37,7 @@ from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.phases.plan_schedule import has_torque_jumps, require_covered, with_plan_step_capacity
 from wholearm_jax.phases.plan_tracing import trace
 from wholearm_jax.phases.result import Result, build_result
-from wholearm_jax.simulation import IntegratorOptions, tolerance_as_data
+from wholearm_jax.simulation import IntegratorOptions, options_with_steps, tolerance_as_data
 
 
 @on_host("wholearm_jax.margin is the margin as a number that can be transformed")
@@ -99,8 +99,7 @@ def precompile_simulate(
 
 def _integrator_options(scene: Scene, torque: TorqueSchedule, tolerance: float, max_steps: int) -> IntegratorOptions:
     """Return the integrator options of `simulate`."""
-    stages, jumps = max(8, max_steps // 32), has_torque_jumps(scene, torque)
-    options = IntegratorOptions(tolerance=tolerance, max_steps=max_steps, max_stages=stages, has_jumps=jumps)
+    options = options_with_steps(max_steps, tolerance=tolerance, has_jumps=has_torque_jumps(scene, torque))
     return with_plan_step_capacity(options, scene, torque)
 
 

@@ -21,7 +21,7 @@ from wholearm_jax.phases.phase_simulation import SimulatedPhase
 from wholearm_jax.phases.phase_tracing import TracedPhase
 from wholearm_jax.phases.plan_simulation import simulate_phases
 from wholearm_jax.phases.result import PhaseResult, Result
-from wholearm_jax.simulation import IntegratorOptions
+from wholearm_jax.simulation import options_with_steps
 
 TORQUE_ERROR = 1e-6  # relative, of a difference quotient
 MOTOR_ERROR = 0.01  # of its torque, that a motor may have
@@ -47,7 +47,7 @@ def torque_accuracy(result: Result, *, position: float = END_POSITION, angle: fl
     traced = tuple(phase.traced for phase in result.phases)
     steps = max(len(phase.outcome.motion.s) for phase in result.phases) - 1  # as many as the simulation was allowed
     jumps = any(_jumps_in_motion(phase, result.torque) for phase in result.phases)
-    options = IntegratorOptions(max_steps=steps, max_stages=max(8, steps // 32), has_jumps=jumps)
+    options = options_with_steps(steps, has_jumps=jumps)
 
     def simulated(torque: TorqueSchedule) -> Sequence[SimulatedPhase]:
         return simulate_phases(result.scene, torque, traced, options)

@@ -26,13 +26,12 @@ from wholearm_jax.model import (
 )
 from wholearm_jax.phases import configuration, trace_phase
 from wholearm_jax.planning.contact_rows import formation_in_numpy
-from wholearm_jax.planning.path_choices import PathChoice, path_choices
+from wholearm_jax.planning.path_choices import LEAST_HOLD, PathChoice, path_choices
 from wholearm_jax.planning.successors import touching_contacts
 from wholearm_jax.tracing import PathEnd, Resolution, feature_clearance, pivot_clearance
 
 MOVES_PER_CALL = 8  # paths that one call of the program traces; the last call is filled up
 SHORTEST_MOVE = 0.02  # path length, in the object's radii, below which a hand cannot tell a move from standing still
-LEAST_HOLD = 0.02  # distance of a contact from its feature's end, likewise, below which a hand may miss it
 PLACES = 33  # configurations of a path that are kept
 RESOLUTION = Resolution(panels=16)  # of the planner's tables: forces to three digits
 

@@ -11,7 +11,7 @@ from wholearm_jax.model import AWAY_NAMES, COORDINATES, Scene, feature_pair
 from wholearm_jax.planning.contact_rows import ContactRows, contact_rows
 from wholearm_jax.planning.rest_margins import Tangents, both_senses, path_tangents, rest_margins
 
-WELL_INSIDE = 0.02  # distance of a contact from its feature's end, in object radii, within which it may slip off there
+LEAST_HOLD = 0.02  # distance of a contact from its feature's end, in object radii, below which a hand may miss it
 CLOSING_RATE = 1e-3  # of a gap, for a unit step along a path, above which a contact that touches already ends the path
 PathChoice = tuple[tuple[str, ...], str]  # names of a formation's contacts, and the direction as scene files write it
 
@@ -89,7 +89,7 @@ def _may_begin(rows: ContactRows, tangents: Tangents, floor: float) -> Bool[np.n
 
 def _are_stopped(rows: ContactRows, tangents: Tangents) -> Bool[np.ndarray, "formations"]:
     """Which paths end where they begin: one of the other contacts is pressed on, away from its feature's ends."""
-    others = np.tile(rows.clearance > WELL_INSIDE, (len(tangents.number), 1))
+    others = np.tile(rows.clearance > LEAST_HOLD, (len(tangents.number), 1))
     np.put_along_axis(others, tangents.number, False, axis=1)
     approach = -tangents.direction @ rows.normal.T
     return np.any(others & (approach > CLOSING_RATE), axis=1)

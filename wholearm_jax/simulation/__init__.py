@@ -9,7 +9,13 @@ from wholearm_jax.simulation.closed_loop import (
     torque_of,
 )
 from wholearm_jax.simulation.integrator import TerminalEvent, integrate_adaptive
-from wholearm_jax.simulation.integrator_options import Adjoint, IntegratorOptions, tolerance_as_data, with_step_capacity
+from wholearm_jax.simulation.integrator_options import (
+    Adjoint,
+    IntegratorOptions,
+    options_with_steps,
+    tolerance_as_data,
+    with_step_capacity,
+)
 from wholearm_jax.simulation.interpolation import (
     DenseOutput,
     dense_output,

@@ -47,6 +47,11 @@ class IntegratorOptions(eqx.Module):
     adjoint: Adjoint = eqx.field(static=True, default=Adjoint.NONE, converter=Adjoint)  # or its value, a word
 
 
+def options_with_steps(max_steps: int, **others) -> IntegratorOptions:
+    """Return options with room for so many steps a phase, and for as many smooth stages as go with them."""
+    return IntegratorOptions(max_steps=max_steps, max_stages=max(8, max_steps // 32), **others)
+
+
 def tolerance_as_data(options: IntegratorOptions, dtype) -> IntegratorOptions:
     """Return the options with a tolerance that is an array: all tolerances share a program."""
     tolerance = as_strong_array(options.tolerance, dtype)
