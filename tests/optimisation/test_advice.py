@@ -56,6 +56,18 @@ def test_too_few_knots_are_named_with_a_number_that_works(heptagon):
     assert wa.optimise(heptagon, knots=KNOTS).result.status is wa.Status.OK
 
 
+def test_a_phase_that_is_too_slow_to_depart_is_told_a_duration_that_works():
+    """Nothing holds the object at the start, and a gentle start may lead either way: more knots do not help."""
+    scene = wa.load(CASES.parent / "wedged_departure.toml")
+    failed = wa.optimise(scene, knots=51, steps=40).result.phases[0]
+    assert failed.status is wa.Status.AMBIGUOUS
+    assert "so slowly no torques led to it" in failed.message
+    assert "knots" not in failed.message
+    advised = float(re.search(r"--set 0\.duration=([\d.]+)", failed.message)[1])
+    assert advised < 0.5 * float(scene.phases[0].duration)
+    assert wa.optimise(with_duration(scene, 0, advised), knots=51, steps=40).result.status is wa.Status.OK
+
+
 def test_phases_without_a_stop_that_are_too_slow_are_told_durations_that_work():
     scene = wa.load("flight")
     for k, phase in enumerate(scene.phases):

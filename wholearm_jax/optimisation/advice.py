@@ -40,6 +40,7 @@ SPARE_TIME = 1.5  # a phase should have this much more time than its fastest mot
 MIN_KNOTS = 11  # fewer are too few for most phases
 ENOUGH_MARGIN = 0.9  # share of the largest margin with which phases at speed are fast enough
 AMPLE_TIME = 10.0  # time of such a phase, over its fastest motion with that margin, that torques lead it through
+ENOUGH_KNOTS = 51  # of a phase between rests, with which it is not for want of knots that a slow one fails
 LONG_SHARE = 0.5  # ample time as a share of a duration that is long
 
 
@@ -163,8 +164,8 @@ def _explain_motion(
     stopping = f"stop before the change of formation (`arrive = \"rest\"` in phase '{stop}')"
     if phase.is_opened_at_its_beginning and stop is not None:
         return None, stopping
-    if shorter:
-        changes = " ".join(f"--set {k}.duration={duration:g}" for k, duration in shorter.items())
+    changes = " ".join(f"--set {k}.duration={duration:g}" for k, duration in shorter.items())
+    if shorter and stop is not None:
         detail = "so slowly no torques led it through the phases without a stop"
         return detail, f"give them less time ({changes}), or {stopping}"
     if phase.status is Status.MAX_STEPS:
@@ -176,6 +177,8 @@ def _explain_motion(
         return f"{possible} where torques may jump", f"allow faster torques (--rate-limit) or more time ({longer})"
     if stop is not None:
         return f"{possible}, but at speed no torques led to it", f"{stopping}, or try another --passing"
+    if shorter and search.knots >= ENOUGH_KNOTS:
+        return f"{possible}, but so slowly no torques led to it", f"give it less time ({changes})"
     return f"{possible}, but {search.knots} knots did not lead to it", (
         f"take more knots (--knots {max(MIN_KNOTS, 2 * search.knots)})"
     )
@@ -184,8 +187,8 @@ def _explain_motion(
 def _shorter_durations(
     scene: Scene, traced: tuple[TracedPhase, ...], failed: Sequence[int]
 ) -> dict[int, dict[int, float]]:
-    """Return shorter durations [s] of the phases that a failed one is coupled with, where theirs are long."""
-    groups = [group for group in group_phases(scene) if len(group) > 1 and not set(group).isdisjoint(failed)]
+    """Return shorter durations [s] of a failed phase and those that it is coupled with, where theirs are long."""
+    groups = [group for group in group_phases(scene) if not set(group).isdisjoint(failed)]
     best = convex_bounds(scene, any_duration=True, traced=traced) if groups else ()
     found = {}
     for group in groups:
@@ -195,7 +198,8 @@ def _shorter_durations(
             continue
         fastest = shortest_motions(scene, level, traced=traced)
         durations = {k: float(scene.phases[k].duration) for k in group}
-        share = max(AMPLE_TIME * motion.duration / durations[k] for k in group if (motion := fastest[k]) is not None)
+        ample = AMPLE_TIME if len(group) > 1 else SPARE_TIME
+        share = max(ample * motion.duration / durations[k] for k in group if (motion := fastest[k]) is not None)
         if share < LONG_SHARE:
             shorter = {k: round_up_digits(share * duration) for k, duration in durations.items()}
             found |= {k: shorter for k in group}

@@ -30,6 +30,7 @@ from wholearm_jax.phases.phase_ends import (
     ends_at_stop,
     final_configuration,
     formation_at_end,
+    rest_terms,
     statics_at_start,
     target_configuration,
 )

@@ -18,22 +18,20 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from wholearm_jax.core import CachedJit, LinearProgramme, LinearProgrammeSolution, Status
-from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
+from wholearm_jax.core import LinearProgramme, LinearProgrammeSolution, Status
 from wholearm_jax.margin import (
     MARGIN_TIE,
     MIN_REST_MARGIN,
     RestAccelerations,
     StaticMargin,
     Statics,
-    cone_facets,
     contact_statics,
 )
 from wholearm_jax.model import AWAY_NAMES, EDGE, Arrival, Phase, Scene, feature_pair, parse_contact, rigid_body
+from wholearm_jax.phases.phase_ends import rest_terms
 from wholearm_jax.phases.phase_tracing import TracedPhase
 
 POINT_TOL = 1e-6  # distance of a tip from a vertex, in the object's radius, at which the two are one point
@@ -175,23 +173,11 @@ def _tip_to_vertex(scene: Scene, z, finger: int, vertex: int) -> float:
 def _one_contact(scene: Scene, name: str, phase: Phase, path: TracedPhase, end: int) -> OneContact:
     """Return the object at an end (0 or -1) of a phase's path."""
     dynamics = path.dynamics
-    forward, backward, slack = jax.device_get(_terms_at_end(dynamics, jnp.asarray(end)))
+    accelerations, slack = rest_terms(dynamics, end)
     z = path.begin if end == 0 else path.end
     return OneContact(
         name=name,
         statics=contact_statics(scene, phase.formation, z),
-        accelerations=RestAccelerations(forward, backward),
+        accelerations=accelerations,
         slack=slack,
     )
-
-
-@CachedJit
-def _terms_at_end(dynamics: PathDynamics, end) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "facets 3"]]:
-    """Return accelerations, forward and backward, and slacks of forces at rest, linear in `(1, tau1, tau2)`."""
-    segment = jnp.where(end == 0, 0, dynamics.count - 1)
-    s = jnp.where(end == 0, dynamics.breakpoints[0], dynamics.breakpoints[-1])
-    panel, xi = locate_panel(dynamics, segment, s)
-    at_rest = jnp.array([0, 3, 4])
-    slack = cone_facets(dynamics, evaluate(dynamics.force, panel, xi))
-    forward = evaluate(dynamics.acceleration, panel, xi)
-    return forward[at_rest], evaluate(dynamics.reverse_acceleration, panel, xi), slack[:, at_rest]

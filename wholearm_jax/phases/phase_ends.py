@@ -2,11 +2,12 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from wholearm_jax.core import CachedJit
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
-from wholearm_jax.margin import RestAccelerations, Statics, contact_statics
+from wholearm_jax.margin import RestAccelerations, Statics, cone_facets, contact_statics
 from wholearm_jax.model import (
     FEATURE_GROUPS,
     FINGER_ROOT,
@@ -53,15 +54,32 @@ def target_configuration(phase: Phase, traced: TracedPhase) -> Float[Array, "5"]
 
 def statics_at_start(scene: Scene, phase: Phase, traced: TracedPhase) -> tuple[Statics, RestAccelerations]:
     """Return the statics at a phase's start, and the accelerations with which the object would depart from there."""
-    forward, backward = jax.device_get(_start_accelerations(traced.dynamics))
-    statics = contact_statics(scene, phase.formation, traced.begin)
-    return statics, RestAccelerations(forward[[0, 3, 4]], backward)
+    return contact_statics(scene, phase.formation, traced.begin), rest_terms(traced.dynamics, 0)[0]
 
 
-@jax.jit
-def _start_accelerations(dynamics: PathDynamics) -> tuple[Float[Array, "5"], Float[Array, "3"]]:
-    panel, xi = locate_panel(dynamics, jnp.asarray(0, int), dynamics.breakpoints[0])
-    return evaluate(dynamics.acceleration, panel, xi), evaluate(dynamics.reverse_acceleration, panel, xi)
+def rest_terms(dynamics: PathDynamics, end: int) -> tuple[RestAccelerations, Float[np.ndarray, "facets 3"]]:
+    """Return accelerations and slacks of contact forces [N] of an object at rest at an end of a path.
+
+    Args:
+        dynamics: of the path.
+        end: 0 for its start, -1 for its end.
+
+    Returns:
+        The accelerations, and the slacks while it moves forward, linear in `(1, tau1, tau2)`.
+    """
+    forward, backward, slack = jax.device_get(_rest_terms(dynamics, jnp.asarray(end)))
+    return RestAccelerations(forward, backward), slack
+
+
+@CachedJit
+def _rest_terms(dynamics: PathDynamics, end) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "facets 3"]]:
+    segment = jnp.where(end == 0, 0, dynamics.count - 1)
+    s = jnp.where(end == 0, dynamics.breakpoints[0], dynamics.breakpoints[-1])
+    panel, xi = locate_panel(dynamics, segment, s)
+    at_rest = jnp.array([0, 3, 4])
+    slack = cone_facets(dynamics, evaluate(dynamics.force, panel, xi))
+    forward = evaluate(dynamics.acceleration, panel, xi)
+    return forward[at_rest], evaluate(dynamics.reverse_acceleration, panel, xi), slack[:, at_rest]
 
 
 def formation_at_end(scene: Scene, phase: Phase, traced: TracedPhase) -> ContactFormation:
