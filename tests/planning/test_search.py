@@ -271,6 +271,16 @@ def test_a_goal_in_another_unit_is_not_searched_for(part, by, message):
     assert found.nodes == 0
 
 
+def test_a_goal_at_which_the_start_is_already_is_not_searched_for(part):
+    """Within the tolerances there is nothing to do; with smaller ones the same goal has a plan."""
+    there = wa.plan(part, by={"x": 0.0005})
+    assert not there.found
+    assert there.nodes == 0
+    assert there.reason.startswith("no plan: the start is within the goal's tolerances already")
+    nearer = wa.plan(part, by={"x": 0.0005}, tolerance={"x": 1e-4}, count=1)
+    assert nearer.plans[0].ends[-1][0] == pytest.approx(float(part.start[0]) + 0.0005, abs=1e-4)
+
+
 def test_a_start_at_which_links_overlap_says_which(part):
     """Of fingers so long that they cross above the object, by shapely."""
     hand = eqx.tree_at(lambda h: h.length, part.hand, jnp.full(2, 0.17))

@@ -34,20 +34,25 @@ def explain_failure(goal: Goal, z: np.ndarray, moves: Sequence[Move], floor: flo
     return f"no plan: {limit}; nearest: {', '.join(missing) or 'at the goal'}; there {'; '.join(lines)}"
 
 
-def explain_overlaps(overlaps: Sequence[str]) -> str:
-    """Say what overlaps at the start of a search, and what helps; nothing where nothing does.
+def explain_vain_search(start: np.ndarray, goal: Goal, hand: Hand, overlaps: Sequence[str]) -> str:
+    """Say why a search need not begin; nothing where it may find a plan.
 
     Args:
+        start: the configuration (5,), SI.
+        goal: the goal.
+        hand: the hand.
         overlaps: what `describe_overlaps` says of the start.
     """
-    if not overlaps:
-        return ""
-    cross = any("cross" in line for line in overlaps)
-    advice = "search for a hand that fits, as with --hand-from, or let its fingers pass each other (layered)"
-    return f"at the start {'; '.join(overlaps)}: {advice if cross else 'correct its pose and angles'}"
+    if overlaps:
+        cross = any("cross" in line for line in overlaps)
+        advice = "search for a hand that fits, as with --hand-from, or let its fingers pass each other (layered)"
+        return f"at the start {'; '.join(overlaps)}: {advice if cross else 'correct its pose and angles'}"
+    if goal.is_reached(start):
+        return "the start is within the goal's tolerances already; smaller ones (--tolerance) ask for more"
+    return _explain_far_goal(goal, hand)
 
 
-def explain_far_goal(goal: Goal, hand: Hand) -> str:
+def _explain_far_goal(goal: Goal, hand: Hand) -> str:
     """Say that a goal is so far off that its unit must be another one; nothing where it may be meant."""
     far = FAR * float((abs(hand.joint).max(1) + hand.length).max())
     for name, value in goal.values.items():

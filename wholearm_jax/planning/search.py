@@ -37,7 +37,7 @@ from wholearm_jax.planning.goal import Goal, make_goal
 from wholearm_jax.planning.improvement import improve_plan, is_secure
 from wholearm_jax.planning.move_stops import move_stops
 from wholearm_jax.planning.moves import SHORTEST_MOVE, Move, moves_from
-from wholearm_jax.planning.obstructions import explain_failure, explain_far_goal, explain_overlaps
+from wholearm_jax.planning.obstructions import explain_failure, explain_vain_search
 from wholearm_jax.planning.plans import (
     Edge,
     Plan,
@@ -146,7 +146,7 @@ def plan(
         regrasp_cost=regrasp_cost,
     )
     overlaps = describe_overlaps(scene, as_device_array(start))
-    vain = explain_overlaps(overlaps) or explain_far_goal(search.goal, scene.hand)
+    vain = explain_vain_search(start, search.goal, scene.hand, overlaps)
     if vain:
         return PlanningResult(start, search.goal, (), None, f"no plan: {vain}", 0, 0, ())
     _push(search, start, (), touching)
