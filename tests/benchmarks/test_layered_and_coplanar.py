@@ -16,7 +16,8 @@ from wholearm_jax.core import Status
 from wholearm_jax.phases.phase_tracing import trace_phase_path
 from wholearm_jax.tracing import PathEnd, Resolution
 
-COUNT = 400
+COUNT = 1000
+LEAST = 10  # scenes whose fingers would cross on the way that a test must see; more, so that rounding decides nothing
 DEEP = 1e-4  # of the object's radius, what places along a path cannot miss
 
 
@@ -55,7 +56,7 @@ def test_fingers_that_would_cross_end_the_path_or_refuse_its_start(both):
     cross = (depth.max(1) > DEEP) & (layered[0] == Status.OK)
     begins = depth[:, 0] > DEEP
     assert (cross & begins).sum() > COUNT / 40
-    assert (cross & ~begins).sum() > COUNT / 40
+    assert (cross & ~begins).sum() > LEAST
     assert set(coplanar[0][cross & begins]) == {Status.OBSTACLE}
     stopped = cross & ~begins & (coplanar[0] == Status.OK)
     assert stopped.sum() > 0.9 * (cross & ~begins).sum()
