@@ -16,8 +16,7 @@ from wholearm_jax.core import Status
 from wholearm_jax.phases.phase_tracing import trace_phase_path
 from wholearm_jax.tracing import PathEnd, Resolution
 
-COUNT = 1000
-LEAST = 10  # scenes whose fingers would cross on the way that a test must see; more, so that rounding decides nothing
+COUNT = 400
 DEEP = 1e-4  # of the object's radius, what places along a path cannot miss
 
 
@@ -34,7 +33,7 @@ def paths_of(scenes):
 @pytest.fixture(scope="module")
 def both():
     """Random scenes on layered and on coplanar hands, and how deep fingers are in each other along layered paths."""
-    scenes = draw(COUNT, 5)
+    scenes = draw(COUNT, 22)
     layered, coplanar = (
         jax.tree.map(np.asarray, paths_of(to_device(Scenes(*scenes._replace(layered=np.full(COUNT, value))))))
         for value in (True, False)
@@ -56,7 +55,7 @@ def test_fingers_that_would_cross_end_the_path_or_refuse_its_start(both):
     cross = (depth.max(1) > DEEP) & (layered[0] == Status.OK)
     begins = depth[:, 0] > DEEP
     assert (cross & begins).sum() > COUNT / 40
-    assert (cross & ~begins).sum() > LEAST
+    assert (cross & ~begins).sum() > COUNT / 40
     assert set(coplanar[0][cross & begins]) == {Status.OBSTACLE}
     stopped = cross & ~begins & (coplanar[0] == Status.OK)
     assert stopped.sum() > 0.9 * (cross & ~begins).sum()

@@ -19,7 +19,7 @@ from wholearm_jax.dynamics import PathDynamics
 from wholearm_jax.margin import MarginBound, affine_coefficients, best_quasistatic_torque
 from wholearm_jax.model import Arrival, Scene
 from wholearm_jax.optimisation.best_motion import convex_bounds, shortest_motions
-from wholearm_jax.optimisation.quasistatic_plan import bounds
+from wholearm_jax.optimisation.quasistatic_plan import DEFAULT_KNOTS, bounds
 from wholearm_jax.optimisation.singular_advice import explain_singular
 from wholearm_jax.phases import (
     OPENING_ADVICE,
@@ -40,7 +40,6 @@ SPARE_TIME = 1.5  # a phase should have this much more time than its fastest mot
 MIN_KNOTS = 11  # fewer are too few for most phases
 ENOUGH_MARGIN = 0.9  # share of the largest margin with which phases at speed are fast enough
 AMPLE_TIME = 10.0  # time of such a phase, over its fastest motion with that margin, that torques lead it through
-ENOUGH_KNOTS = 51  # of a phase between rests, with which it is not for want of knots that a slow one fails
 LONG_SHARE = 0.5  # ample time as a share of a duration that is long
 
 
@@ -84,7 +83,7 @@ def explain(
     refused = [k for k in searched if _no_torque_holds(result.phases[k], float(values[k].value))]
     open_ones = [k for k in searched if k not in refused and result.phases[k].arrive is not Arrival.HOLD]
     fastest = shortest_motions(result.scene, 0.0, traced=traced) if open_ones else (None,) * len(traced)
-    shorter = {} if search is None else _shorter_durations(result.scene, traced, open_ones)
+    shorter = {} if search is None else _shorter_durations(result.scene, traced, open_ones, search.knots)
     for k, shortest in too_short.items():
         detail, remedy = _explain_motion(k, phases[k], shortest, search)
         phases[k] = replace(phases[k], status=Status.TOO_SHORT, contact=None, slips=False, detail=detail, remedy=remedy)
@@ -177,7 +176,7 @@ def _explain_motion(
         return f"{possible} where torques may jump", f"allow faster torques (--rate-limit) or more time ({longer})"
     if stop is not None:
         return f"{possible}, but at speed no torques led to it", f"{stopping}, or try another --passing"
-    if shorter and search.knots >= ENOUGH_KNOTS:
+    if shorter:
         return f"{possible}, but so slowly no torques led to it", f"give it less time ({changes})"
     return f"{possible}, but {search.knots} knots did not lead to it", (
         f"take more knots (--knots {max(MIN_KNOTS, 2 * search.knots)})"
@@ -185,10 +184,14 @@ def _explain_motion(
 
 
 def _shorter_durations(
-    scene: Scene, traced: tuple[TracedPhase, ...], failed: Sequence[int]
+    scene: Scene, traced: tuple[TracedPhase, ...], failed: Sequence[int], knots: int
 ) -> dict[int, dict[int, float]]:
-    """Return shorter durations [s] of a failed phase and those that it is coupled with, where theirs are long."""
+    """Return shorter durations [s] of a failed phase and those that it is coupled with, where theirs are long.
+
+    None of a phase between rests that fails with few torque knots: more may lead through it.
+    """
     groups = [group for group in group_phases(scene) if not set(group).isdisjoint(failed)]
+    groups = [group for group in groups if len(group) > 1 or knots >= DEFAULT_KNOTS]
     best = convex_bounds(scene, any_duration=True, traced=traced) if groups else ()
     found = {}
     for group in groups:

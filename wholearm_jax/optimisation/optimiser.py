@@ -71,7 +71,7 @@ from wholearm_jax.optimisation.coupled_phases import (
 from wholearm_jax.optimisation.plan_limits import limit_by_hand_overs, tighten_bounds, too_short_phases
 from wholearm_jax.optimisation.plan_transitions import holding_schedule, rest_transitions
 from wholearm_jax.optimisation.precompilation import precompile_optimise
-from wholearm_jax.optimisation.quasistatic_plan import bounds, require_knots
+from wholearm_jax.optimisation.quasistatic_plan import DEFAULT_KNOTS, bounds, require_knots
 from wholearm_jax.optimisation.rest_transition import RestTransition
 from wholearm_jax.optimisation.shortest_plan import shortest_plan
 from wholearm_jax.optimisation.solver import IterationRecord
@@ -89,7 +89,7 @@ from wholearm_jax.phases import (
 )
 from wholearm_jax.simulation import IntegratorOptions, with_step_capacity
 
-DEFAULT_KNOTS, MOST_KNOTS = 51, 201  # of a phase, where their number is not given
+MOST_KNOTS = 201  # of a phase that stays below its bound with fewer, where their number is not given
 MAX_DWELLS = (0.25, 0.1)  # fractions of a phase for which the object may wait before it starts, at limited rates
 MIN_TRANSITION_SPEED = 0.2  # least speed with which a phase is entered at speed, over its mean speed
 

@@ -18,8 +18,10 @@ from wholearm_jax.optimisation.initial_guess import initial_guesses, transformed
 from wholearm_jax.optimisation.plan_transitions import holding_schedule
 from wholearm_jax.phases import TracedPhase, idle_torques, starts_at_rest, statics_at_start, trace
 
+DEFAULT_KNOTS = 51  # torque knots of a phase, where their number is not given
 
-def quasistatic(scene: Scene, *, knots: int = 51, traced: tuple[TracedPhase, ...] = ()) -> TorqueSchedule:
+
+def quasistatic(scene: Scene, *, knots: int = DEFAULT_KNOTS, traced: tuple[TracedPhase, ...] = ()) -> TorqueSchedule:
     """Return the quasi-static torques: at each knot the best internal force for a rest-to-rest motion, in closed form.
 
     The motion's speed is `v ~ u^p (1 - u)^q` in `u = t / duration`, with `p = q = 1` unless another of

@@ -48,7 +48,7 @@ class IntegratorOptions(eqx.Module):
 
 
 def options_with_steps(max_steps: int, **others) -> IntegratorOptions:
-    """Return options with room for so many steps a phase, and for as many smooth stages as go with them."""
+    """Return options with capacity for so many steps a phase, and for as many smooth stages as go with them."""
     return IntegratorOptions(max_steps=max_steps, max_stages=max(8, max_steps // 32), **others)
 
 
