@@ -1,5 +1,6 @@
 """Every test computes in 64 bits, compiles as the command line does, and leaves room for those that follow."""
 
+import ctypes
 import gc
 import os
 import sys
@@ -12,6 +13,7 @@ from wholearm_jax.cli import app as command
 from wholearm_jax.core.config import configure
 
 MAPPED = 30_000  # half of the memory areas that Linux grants a process by default
+RESIDENT = 4 << 30  # memory of a worker [bytes], above which two of them leave little of 16 GiB to what tests start
 
 configure()
 gc.set_threshold(100_000, 20, 20)
@@ -49,9 +51,17 @@ def _programs_are_kept(request):
 def _room_for_programs():
     """Each compiled program maps a thousand small areas of memory, and a process that runs out of them crashes."""
     yield
-    areas = Path("/proc/self/maps")
-    if areas.exists() and len(areas.read_bytes().splitlines()) > MAPPED:
+    if Path("/proc/self").exists() and (_areas() > MAPPED or _resident() > RESIDENT):
         jax.clear_caches()
+        getattr(ctypes.CDLL(None), "malloc_trim", lambda _: 0)(0)  # the C library would keep what is free
+
+
+def _areas() -> int:
+    return len(Path("/proc/self/maps").read_bytes().splitlines())
+
+
+def _resident() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from wholearm_jax.core import Status, require_positive, require_x64
 from wholearm_jax.ensembles.ensemble import Ensemble
 from wholearm_jax.ensembles.sampled_margins import SampledMargins, SampledScenes, margins_and_gradient, trace_samples
 from wholearm_jax.model import TorqueSchedule, limit_violations
-from wholearm_jax.optimisation import optimise
+from wholearm_jax.optimisation import DEFAULT_KNOTS, optimise
 from wholearm_jax.phases import has_torque_jumps, require_covered, require_motion, simulate, with_plan_step_capacity
 from wholearm_jax.simulation import Adjoint, IntegratorOptions
 
@@ -56,7 +56,7 @@ def optimise_robustly(
     *,
     samples: int = 64,
     quantile: float = 0.0,
-    knots: int = 51,
+    knots: int = DEFAULT_KNOTS,
     steps: int = 60,
     arrival: float = 0.01,
     rate: float = 2e-3,

@@ -18,7 +18,7 @@ from wholearm_jax.optimisation.coupled_phases import (
 from wholearm_jax.optimisation.initial_guess import initial_guesses
 from wholearm_jax.optimisation.iteration import init_solver, take_step
 from wholearm_jax.optimisation.multiple_shooting import extra_parts
-from wholearm_jax.optimisation.quasistatic_plan import rolling_count, upper_bound
+from wholearm_jax.optimisation.quasistatic_plan import DEFAULT_KNOTS, rolling_count, upper_bound
 from wholearm_jax.optimisation.solver import INTERVAL_OPTIONS
 from wholearm_jax.optimisation.variables import Variables
 from wholearm_jax.phases import group_phases, precompile_simulation
@@ -27,7 +27,7 @@ from wholearm_jax.tracing import Resolution
 
 
 def precompile_optimise(
-    scene: Scene, *, knots: int = 51, optimiser: optax.GradientTransformation | None = None
+    scene: Scene, *, knots: int = DEFAULT_KNOTS, optimiser: optax.GradientTransformation | None = None
 ) -> tuple[BackgroundTask, ...]:
     """Compile what `optimise` runs, in the background; returns the tasks to wait for."""
     sizes = sorted({len(group) for group in group_phases(scene) if scene.phases[group[0]].arrive is not Arrival.HOLD})
