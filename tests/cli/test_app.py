@@ -72,6 +72,9 @@ def test_help_lists_the_commands(wholearm):
     assert code == 0
     for name in ("optimise", "simulate", "search", "report", "formations", "execute", "scenes", "tradeoff"):
         assert f"  {name} " in out
+    commands = out.partition("Commands:")[2].strip().splitlines()
+    assert len(commands) == 11
+    assert all(line.endswith(".") and not line.endswith("...") for line in commands)  # each on one line, as a whole
 
 
 def test_runs_as_a_program(tmp_path):

@@ -29,19 +29,24 @@ def found(box):
     return wa.plan_with_hand(box, by={"x": -0.004}, **SEARCH)
 
 
+def _with_hand(box, trial):
+    """Put a scene together in which the box lies in the hand of a trial."""
+    hand = {"joint": [[trial.joint, 0.0], [-trial.joint, 0.0]], "length": [trial.length] * 2}
+    inertia = np.asarray(box.hand.inertia) * (trial.length / np.asarray(box.hand.length)) ** 2
+    new = tuple(np.asarray(value) for value in (*hand.values(), inertia))
+    scene = eqx.tree_at(lambda s: (s.hand.joint, s.hand.length, s.hand.inertia), box, new)
+    z = resting_configuration(scene.object, scene.hand, 0, 0.0)
+    return eqx.tree_at(lambda s: s.start, scene, np.asarray(z))
+
+
 def test_the_best_of_the_hands_has_the_largest_certificate(box, found):
     """Each hand that was tried is planned for by itself, from a scene that is put together here."""
     assert len(found.trials) == 4
     assert found.best.bound == max(one.bound for one in found.trials if not np.isnan(one.bound))
     for one in found.trials:
-        hand = {"joint": [[one.joint, 0.0], [-one.joint, 0.0]], "length": [one.length] * 2}
-        inertia = np.asarray(box.hand.inertia) * (one.length / np.asarray(box.hand.length)) ** 2
-        new = tuple(np.asarray(value) for value in (*hand.values(), inertia))
-        scene = eqx.tree_at(lambda s: (s.hand.joint, s.hand.length, s.hand.inertia), box, new)
         if np.isnan(one.bound):
             continue
-        z = resting_configuration(scene.object, scene.hand, 0, 0.0)
-        scene = eqx.tree_at(lambda s: s.start, scene, np.asarray(z))
+        scene = _with_hand(box, one)
         planned = wa.plan(scene, by={"x": -0.004}, max_phases=1, max_nodes=1)
         assert planned.found == np.isfinite(one.bound)
         if planned.found:
@@ -90,6 +95,21 @@ def test_where_no_hand_has_a_plan_the_scene_stays(box):
     assert found.best is None
     assert found.planning is None
     assert found.scene is box
+
+
+def test_where_no_hand_has_a_plan_the_nearest_is_known(box):
+    goal = {"by": {"x": -0.06}, "max_nodes": 2, "max_phases": 3}
+    found = wa.plan_with_hand(box, **SEARCH | goal)
+    assert found.best is None
+    assert found.scene is box
+    closing = [trial for trial in found.trials if not np.isnan(trial.bound)]
+    alone = [wa.plan(_with_hand(box, trial), **goal).distance for trial in closing]
+    assert len(set(alone)) > 1
+    best = closing[int(np.argmin(alone))]
+    assert np.asarray(found.nearest.hand.length).tolist() == [best.length] * 2
+    assert float(found.nearest.hand.joint[0, 0]) == best.joint
+    out_of_reach = wa.plan_with_hand(box, **SEARCH | {"by": {"x": -50.0}})
+    assert out_of_reach.nearest is None  # no search begins
 
 
 def test_ranges_and_starts_that_cannot_be_are_refused(box):

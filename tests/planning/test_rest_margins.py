@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -72,6 +73,16 @@ def test_moves_above_a_floor_are_those_whose_margin_exceeds_it(name, share):
     assert 0 < len(above) < len(moves)
     assert above <= {_key(move) for move in moves_from(scene, z, floor=floor)} <= above | unknown
     assert len(unknown) < len(moves) / 4
+
+
+def test_what_has_no_friction_does_not_roll():
+    """Of a palm without friction; with it some contact of the palm rolls."""
+    scene, z, moves = _moves("heptagon")
+    palm = [name for name in dict.fromkeys(name for move in moves for name in move.contacts) if name.startswith("palm")]
+    assert any("rolling" in name for name in palm)
+    smooth = eqx.tree_at(lambda s: s.object.friction, scene, as_device_array([0.0, 0.1, 0.1]))
+    left = {(move.contacts, move.toward) for move in moves_from(smooth, z)}
+    assert left == {_key(move) for move in moves if not any("palm" in n and "rolling" in n for n in move.contacts)}
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -293,6 +293,9 @@ def test_a_start_at_which_links_overlap_says_which(part):
     assert found.nodes == 0
     assert found.reason.startswith("no plan: at the start finger1 and finger2 cross, ")
     assert found.reason.endswith("layered)")
+    distances = 0.6 * abs(np.asarray(hand.joint)[:, 0]).min(), 1.6 * abs(np.asarray(hand.joint)[:, 0]).max()
+    ranges = "length=0.102:0.272,joint={:.3g}:{:.3g}".format(*distances)
+    assert f"--hand-from {ranges}, or" in found.reason, "as the command line takes it"
     layered = eqx.tree_at(lambda h: h.layered, hand, jnp.array(True))  # what it advises helps: no finger is in the way
     other = wa.plan(eqx.tree_at(lambda s: (s.hand, s.start), part, (layered, jnp.asarray(z))), by={"x": -0.01})
     assert other.nodes > 0

@@ -1,5 +1,4 @@
-"""The command line: `wholearm optimise`, `simulate`, `search`, `check`, `report`, `formations`, `execute`,
-`scene`, `scenes`.
+"""The command line: `wholearm`, whose commands are listed in the order in which a newcomer meets them.
 
 Exit status 0 when the result is `ok`, 1 when the plan fails (its status is printed), 2 for bad input, in one line.
 """
@@ -49,7 +48,7 @@ def _options(
     """Dynamics and torque optimisation of planar whole-arm manipulation."""
 
 
-for command in (check, scene, scenes, plan, optimise, simulate, formations, search, tradeoff, report, execute):
+for command in (scenes, scene, plan, formations, optimise, simulate, search, tradeoff, execute, check, report):
     app.command()(command)
 
 

@@ -59,7 +59,10 @@ def check(
     process: Annotated[int | None, typer.Option(min=0, help="Which of them this is, from 0.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check a schedule, or a controller, in many variants of a scene; the same command goes on where it was stopped."""
+    """Check a schedule, or a controller, in many scenes.
+
+    They vary one scene. The same command goes on where it was stopped.
+    """
     if (polygons is None) == (count is None) or (polygons is None) != bool(vary):
         raise BadInput("check: give either --count, with --vary QUANTITY=AMOUNT, or --polygons FILE.npz")
     if (torque is None) == (controller is None) and not (optimise and torque is None):

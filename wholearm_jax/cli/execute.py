@@ -47,7 +47,10 @@ def execute(
     torque_noise: Annotated[float, typer.Option(min=0.0, help="Standard deviation, a share of the torque.")] = 0.01,
     as_json: AsJson = False,
 ) -> None:
-    """Execute a torque schedule open loop, or a controller, on free bodies with soft contacts, in MuJoCo."""
+    """Execute a torque schedule, or a controller, in MuJoCo.
+
+    A schedule is executed open loop. The bodies are free, and their contacts soft.
+    """
     if (torque is None) == (controller is None):
         raise BadInput("give either --torque FILE or --controller FILE")
     if video and out is None:

@@ -33,13 +33,14 @@ def formations(
     scene: SceneName,
     after: Annotated[str | None, typer.Option(help="A phase, by name or number: list what can follow its end.")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for a picture of all ways: formations.png, .svg, .pdf.")
+        Path | None, typer.Option(help="Folder for a picture of all paths: formations.png, .svg, .pdf.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the formations that hold at a configuration, sliding and rolling, and where their paths lead.
+    """List the formations that hold at a configuration.
 
-    The configuration is the end of a phase, or the start; in a scene without phases, what can begin near its start.
+    Contacts slide and roll; it is said where each path leads. The configuration is the end of a phase, or the start;
+    in a scene without phases, what can begin near its start.
     """
     from wholearm_jax.files import load_start
     from wholearm_jax.phases import describe_overlaps

@@ -56,7 +56,10 @@ def optimise(
     report: Annotated[bool, typer.Option("--report", help="Also report.html, one page with an animation.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find the torques with the largest compressive margin, and check them by simulation."""
+    """Find the torques with the largest compressive margin.
+
+    A simulation checks them.
+    """
     if report and out is None:
         raise BadInput("--report: needs a folder to write to: add --out DIR")
     if feedback and out is None:

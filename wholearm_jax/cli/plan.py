@@ -51,7 +51,7 @@ def plan(
     optimise: Annotated[bool, typer.Option("--optimise", help="Go on to torques for the best plan.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find phases that lead the object from a scene's start to a goal."""
+    """Find phases that lead the object from its start to a goal."""
     from wholearm_jax.files import load_goal, load_start
     from wholearm_jax.planning import make_goal
     from wholearm_jax.planning import plan as find_plans
@@ -93,7 +93,10 @@ def plan(
 
 
 def _find_hand(scene, text: str, wanted: dict[str, Any], limits: dict[str, Any], progress, bar):
-    """Return the scene with the hand, of those in the ranges, on which the goal's plan has the largest certificate."""
+    """Return the scene with the hand, of those in the ranges, on which the goal's plan has the largest certificate.
+
+    Where no hand has a plan, with the one that came nearest to the goal.
+    """
     from wholearm_jax.planning import plan_with_hand
 
     def show(hands: int, bound: float) -> None:
@@ -104,16 +107,23 @@ def _find_hand(scene, text: str, wanted: dict[str, Any], limits: dict[str, Any],
     planned = sum(trial.bound > float("-inf") for trial in found.trials)
     closing = sum(not math.isnan(trial.bound) for trial in found.trials)
     tried = f"of {len(found.trials)} hands {closing} close on the object, {planned} have a plan"
-    if found.best is None:
-        note(f"--hand-from {text}: {tried}; the scene's own hand is kept")
+    chosen = found.scene if found.nearest is None else found.nearest
+    joint, finger = abs(float(chosen.hand.joint[0, 0])), float(chosen.hand.length[0])
+    dimensions = f"joints at -+{joint:.4g} m, fingers {finger:.4g} m long"
+    if found.best is not None:
+        outcome = f"the best: {dimensions}"
+    elif found.nearest is not None:
+        outcome = f"the nearest, searched for longer: {dimensions}"
     else:
-        best = f"joints at -+{found.best.joint:.4g} m, fingers {found.best.length:.4g} m long"
-        note(f"--hand-from {text}: {tried}; the best: {best}")
-    return found.scene
+        outcome = "the scene's own hand is kept"
+    note(f"--hand-from {text}: {tried}; {outcome}")
+    return chosen
 
 
 def _hints(found, scene, limits: dict[str, Any], *, searched_hand: bool) -> list[str]:
     """Say what has not been tried yet that lets more goals be reached; nothing where not even the start is possible."""
+    from wholearm_jax.planning import hand_ranges
+
     hints = []
     if not found.moves and not found.out_of_time:
         return hints
@@ -122,9 +132,7 @@ def _hints(found, scene, limits: dict[str, Any], *, searched_hand: bool) -> list
     if limits["regrasp_cost"] is None:
         hints.append("--regrasp-cost 1, so that fingers may go elsewhere")
     if not searched_hand:
-        lengths, joints = ([float(v) for v in row] for row in (scene.hand.length, abs(scene.hand.joint[:, 0])))
-        length, joint = (f"{0.6 * min(row):.3g}:{1.6 * max(row):.3g}" for row in (lengths, joints))
-        hints.append(f"--hand-from length={length},joint={joint}, to search for the hand")
+        hints.append(f"--hand-from {hand_ranges(scene.hand)}, to search for the hand")
     if "phi" in found.goal.values:
         palm, *fingers = (float(value) for value in scene.object.friction)
         friction = " and more friction at the palm" if palm <= max(fingers) else ""

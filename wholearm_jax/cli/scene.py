@@ -37,7 +37,10 @@ def scene(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write a scene from a drawing: the part at rest on an edge, in a hand that fits it."""
+    """Write a scene from the drawing of a part.
+
+    The part rests on an edge, in a hand that fits it.
+    """
     from wholearm_jax.core import write_atomically
     from wholearm_jax.files import choose_outline, describe_choice, outline_tables, read_outlines, scene_text
 

@@ -27,7 +27,7 @@ def tradeoff(
     changes: Changes = None,
     as_json: AsJson = False,
 ) -> None:
-    """Print the shortest durations of a plan's phases for margins up to the largest."""
+    """Print the shortest durations for margins up to the largest."""
     loaded = load_scene(scene, changes)
     folder = make_output_folder(out)
     from wholearm_jax.optimisation import tradeoff as margin_duration_tradeoff

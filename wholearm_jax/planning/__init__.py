@@ -2,6 +2,7 @@
 
 from wholearm_jax.planning.goal import make_goal
 from wholearm_jax.planning.hand_search import HandSearchResult, HandTrial, plan_with_hand
+from wholearm_jax.planning.obstructions import hand_ranges
 from wholearm_jax.planning.plans import Plan, PlanningResult
 from wholearm_jax.planning.search import plan
 from wholearm_jax.planning.successors import (
@@ -20,6 +21,7 @@ __all__ = [
     "Successor",
     "exit_velocity",
     "flush_sides",
+    "hand_ranges",
     "make_goal",
     "plan",
     "plan_with_hand",

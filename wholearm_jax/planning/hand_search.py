@@ -39,12 +39,16 @@ class HandTrial:
 
 @dataclass(frozen=True)
 class HandSearchResult:
-    """The best hand of those that were tried, the scene with it, and the plans on it."""
+    """The best hand of those that were tried, the scene with it, and the plans on it.
+
+    Where no hand has a plan, the scene is the one that was given.
+    """
 
     best: HandTrial | None  # None: no hand has a plan
     scene: Scene
     planning: PlanningResult | None
     trials: tuple[HandTrial, ...]
+    nearest: Scene | None = None  # where no hand has a plan: the scene with the hand that came nearest to the goal
 
 
 def plan_with_hand(
@@ -121,13 +125,21 @@ def plan_with_hand(
         attempt([better_length], [better_joint], effort)
         best = _best(tried)
     trials = tuple(trial for trial, _, _ in tried.values())
-    return HandSearchResult(None, scene, None, trials) if best is None else HandSearchResult(*tried[best], trials)
+    if best is None:
+        return HandSearchResult(None, scene, None, trials, _nearest(tried))
+    return HandSearchResult(*tried[best], trials)
 
 
 def _best(tried: Mapping[tuple[float, float], tuple[HandTrial, Scene, Any]]) -> tuple[float, float] | None:
     """Return the proportions with the largest certificate, the first of equals."""
     found = [(trial.bound, key) for key, (trial, _, _) in tried.items() if trial.bound > -np.inf]
     return max(found, key=lambda row: round(row[0], 6))[1] if found else None
+
+
+def _nearest(tried: Mapping[Any, tuple[HandTrial, Scene, PlanningResult | None]]) -> Scene | None:
+    """Return the scene whose search came nearest to its goal, the first of equals; None where no search began."""
+    begun = [(found.distance, changed) for _, changed, found in tried.values() if found and found.distance < np.inf]
+    return min(begun, key=lambda row: row[0])[1] if begun else None
 
 
 def _improve_hand(scene: Scene, edge: int, planning: PlanningResult, proportions, ranges, spacing) -> list[float]:

@@ -45,11 +45,19 @@ def explain_vain_search(start: np.ndarray, goal: Goal, hand: Hand, overlaps: Seq
     """
     if overlaps:
         cross = any("cross" in line for line in overlaps)
-        advice = "search for a hand that fits, as with --hand-from, or let its fingers pass each other (layered)"
-        return f"at the start {'; '.join(overlaps)}: {advice if cross else 'correct its pose and angles'}"
+        search = f"search for a hand that fits, as with --hand-from {hand_ranges(hand)}"
+        advice = f"{search}, or let its fingers pass each other (layered)" if cross else "correct its pose and angles"
+        return f"at the start {'; '.join(overlaps)}: {advice}"
     if goal.is_reached(start):
         return "the start is within the goal's tolerances already; smaller ones (--tolerance) ask for more"
     return _explain_far_goal(goal, hand)
+
+
+def hand_ranges(hand: Hand) -> str:
+    """Write ranges around a hand's dimensions as `--hand-from` takes them."""
+    lengths, joints = np.asarray(hand.length), abs(np.asarray(hand.joint)[:, 0])
+    length, joint = (f"{0.6 * row.min():.3g}:{1.6 * row.max():.3g}" for row in (lengths, joints))
+    return f"length={length},joint={joint}"
 
 
 def _explain_far_goal(goal: Goal, hand: Hand) -> str:

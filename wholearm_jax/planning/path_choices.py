@@ -46,7 +46,7 @@ def path_choices(
 ) -> Iterator[PathChoice]:
     """Yield each formation of contacts whose constraints fix a path, with either direction along it.
 
-    Left out are those of which two contacts hold a fingertip at a vertex.
+    Left out are those of which two contacts hold a fingertip at a vertex, or one rolls without friction.
 
     Args:
         scene: the hand and the object.
@@ -80,8 +80,9 @@ def path_choices(
 
 def _may_begin(rows: ContactRows, tangents: Tangents, floor: float) -> Bool[np.ndarray, "formations"]:
     """Which paths begin: with a margin at rest above a floor [N], if there is one, and not stopped at once."""
-    number = tangents.number
+    number, rolling = tangents.number, tangents.number[:, : tangents.rolling]
     begins = tangents.is_path & ~rows.same_tip[number[:, :, None], number[:, None, :]].any((1, 2))
+    begins &= (rows.friction[rolling] > 0).all(1)
     if floor == -np.inf:
         return begins
     return begins & (rest_margins(rows, tangents) > floor) & ~_are_stopped(rows, tangents)

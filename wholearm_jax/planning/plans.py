@@ -78,6 +78,7 @@ class PlanningResult:
     moves: int  # paths that were traced
     graph: tuple[Edge, ...]  # what the search reached, and from where
     out_of_time: bool = False  # whether it ended before all moves were tried
+    distance: float = np.inf  # of the nearest configuration from the goal, in moves as the search estimates them
 
     @property
     def found(self) -> bool:

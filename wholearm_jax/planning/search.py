@@ -171,6 +171,7 @@ def plan(
         moves=search.moves,
         graph=tuple(search.graph),
         out_of_time=out_of_time,
+        distance=search.nearest[0],
     )
 
 
