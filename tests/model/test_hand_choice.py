@@ -1,5 +1,7 @@
 """The hand that is chosen for a part: it closes, its fingers are apart, and the part rests where it tips last."""
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import shapely
@@ -106,3 +108,14 @@ def test_an_arch_stands_on_two_feet():
     z = resting_configuration(shape, choice.hand, 0, choice.x)
     assert z[2] == pytest.approx(0.0)
     assert edge_on_palm(shape, z) == 0
+
+
+@pytest.mark.parametrize(("height", "side"), [(0.0, 1), (0.0, -1), (0.01, 1), (0.01, -1)])
+def test_a_part_does_not_lie_on_a_joint(height, side):
+    """A box 60 mm wide whose end has come 0.1 mm beyond a joint, under which no finger could come out."""
+    shape = polygon(1e-3 * np.array(PARTS["box"], float), 0.1, 0.1)
+    hand = choose_hand(shape).hand
+    hand = eqx.tree_at(lambda h: h.joint, hand, jnp.asarray([[0.05, height], [-0.05, height]]))
+    resting_configuration(shape, hand, 0, side * (0.02 - 1e-4))  # beside it, a finger stands upright
+    with pytest.raises(ValueError, match=f"lies on the joint of finger{1 if side > 0 else 2}"):
+        resting_configuration(shape, hand, 0, side * (0.02 + 1e-4))

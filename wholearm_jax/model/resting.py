@@ -26,7 +26,8 @@ def resting_configuration(shape: Polygon, hand: Hand, edge: int, x: float) -> np
         `z` (5,) in SI units.
 
     Raises:
-        ValueError: if the object has no such edge, cannot lie on it, or a finger does not reach the object.
+        ValueError: if the object has no such edge, cannot lie on it, lies on a finger's joint, or a finger does not
+            reach it.
     """
     body = rigid_body(shape)
     count = int(body.count)
@@ -38,10 +39,14 @@ def resting_configuration(shape: Polygon, hand: Hand, edge: int, x: float) -> np
     if at[:, 1].min() < -height - 1e-9 * np.ptp(corners):
         raise ValueError(f"e{edge}: the object cannot lie on this edge: another vertex is lower")
     at = at + np.array([x, height])
+    place, outline = f"e{edge} at x = {x:.4g} m", shapely.Polygon(at)
+    for finger, joint in enumerate(np.asarray(hand.joint)):
+        if outline.distance(shapely.Point(joint)) <= 1e-9 * np.ptp(corners):
+            raise ValueError(f"{place}: the object lies on the joint of finger{finger + 1}")
     angles = [_closing_angle(at, hand, finger) for finger in range(2)]
     for finger, angle in enumerate(angles):
         if angle is None:
-            raise ValueError(f"e{edge} at x = {x:.4g} m: finger{finger + 1} does not reach the object")
+            raise ValueError(f"{place}: finger{finger + 1} does not reach the object")
     return np.array([x, height, phi, *angles], float)
 
 
