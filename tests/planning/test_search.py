@@ -397,6 +397,17 @@ def test_the_command_says_what_may_help_that_has_not_been_tried(wholearm, tmp_pa
     assert "a start on another edge: what lies flat" in err
 
 
+def test_a_start_beyond_a_joints_range_says_which(part):
+    """Both fingers of a part at rest stand steeper than 45 degrees; with the range that is advised, a search begins."""
+    narrow = eqx.tree_at(lambda s: s.hand.range, part, jnp.asarray([[0.1, np.pi / 4], [0.1, 3.0]]))
+    found = wa.plan(narrow, by={"x": -0.01})
+    beyond = np.degrees(float(part.start[3])) - 45
+    advice = "give the joint more range, or correct its pose and angles"
+    assert found.reason == f"no plan: at the start finger1 is {beyond:.3g} deg beyond its range: {advice}"
+    wide = eqx.tree_at(lambda s: s.hand.range, part, jnp.asarray([[0.1, 3.0], [0.1, 3.0]]))
+    assert wa.plan(wide, by={"x": -0.01}, max_nodes=1).nodes == 1
+
+
 def test_the_command_says_what_a_finger_does_that_moves_alone(wholearm):
     command = ("plan", "heptagon", "--goal", "theta1=0.9", "--regrasp-cost", "0", "--count", "1", "--phases", "1")
     code, out, _ = wholearm(*command)

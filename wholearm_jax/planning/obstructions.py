@@ -44,13 +44,19 @@ def explain_vain_search(start: np.ndarray, goal: Goal, hand: Hand, overlaps: Seq
         overlaps: what `describe_overlaps` says of the start.
     """
     if overlaps:
-        cross = any("cross" in line for line in overlaps)
-        search = f"search for a hand that fits, as with --hand-from {hand_ranges(hand)}"
-        advice = f"{search}, or let its fingers pass each other (layered)" if cross else "correct its pose and angles"
-        return f"at the start {'; '.join(overlaps)}: {advice}"
+        return f"at the start {'; '.join(overlaps)}: {_advise_on_overlaps(overlaps, hand)}"
     if goal.is_reached(start):
         return "the start is within the goal's tolerances already; smaller ones (--tolerance) ask for more"
     return _explain_far_goal(goal, hand)
+
+
+def _advise_on_overlaps(overlaps: Sequence[str], hand: Hand) -> str:
+    """Say what helps where links overlap at the start, or a joint is beyond its range."""
+    if any("cross" in line for line in overlaps):
+        search = f"search for a hand that fits, as with --hand-from {hand_ranges(hand)}"
+        return f"{search}, or let its fingers pass each other (layered)"
+    more_range = "give the joint more range, or " if any("range" in line for line in overlaps) else ""
+    return f"{more_range}correct its pose and angles"
 
 
 def hand_ranges(hand: Hand) -> str:
