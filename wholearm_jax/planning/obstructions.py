@@ -81,10 +81,13 @@ def _explain_far_goal(goal: Goal, hand: Hand) -> str:
 
 
 def _explain_move(move: Move, floor: float) -> str:
+    """Say how small a move's margin gets, and from where on it is too small; or what ends it."""
     name = f"{' '.join(move.contacts)} toward {move.toward}"
     lowest = float(move.margins.min())
     if lowest > floor:
         return f"{name} ends too soon" + (" at an obstacle" if move.end_reason == PathEnd.OBSTACLE else "")
-    where = int(np.argmin(move.margins)) / (len(move.margins) - 1)
+    first, worst = (int(np.argmax(chosen)) for chosen in (move.margins <= floor, move.margins == lowest))
+    percent = 100 / (len(move.margins) - 1)
     held = f"has a margin of {lowest:.3g} N" if np.isfinite(lowest) else "cannot be held by torques within limits"
-    return f"{name} {held} at {100 * where:.0f} % of its path"
+    before = f", first too little at {percent * first:.0f} %" if first < worst else ""
+    return f"{name} {held} at {percent * worst:.0f} % of its path{before}"
