@@ -397,6 +397,28 @@ def test_the_command_says_what_may_help_that_has_not_been_tried(wholearm, tmp_pa
     assert "a start on another edge: what lies flat" in err
 
 
+def test_where_no_hand_has_a_plan_the_command_goes_on_with_the_nearest(wholearm, tmp_path):
+    """Not with the scene's own, whose fingers cross."""
+    data = part_data()
+    for finger in ("finger1", "finger2"):
+        data["hand"][finger]["length"] = 0.17
+    path = write_scene(tmp_path, hand=data["hand"])
+    ranges = {"length": (0.11, 0.13), "joint": (0.07, 0.08)}
+    text = ",".join(f"{name}={low}:{high}" for name, (low, high) in ranges.items())
+    out = tmp_path / "out"
+    code, _, err = wholearm(
+        "plan", path, "--by", "x=-0.5", "--phases", "1", "--hand-from", text, "--out", out, "--count", "1"
+    )
+    assert code == 1
+    nearest = wa.plan_with_hand(load_start(path), by={"x": -0.5}, max_phases=1, count=1, **ranges).nearest.hand
+    joint, length = float(nearest.joint[0, 0]), float(nearest.length[0])
+    said = f"0 have a plan; the nearest, searched for longer: joints at -+{joint:.4g} m, fingers {length:.4g} m long"
+    assert said in err
+    assert "no plan: all moves were tried; nearest: x is off by" in err
+    assert "cross" not in err
+    np.testing.assert_array_equal(wa.load(out / "nearest.toml").hand.length, nearest.length)
+
+
 def test_a_start_beyond_a_joints_range_says_which(part):
     """Both fingers of a part at rest stand steeper than 45 degrees; with the range that is advised, a search begins."""
     narrow = eqx.tree_at(lambda s: s.hand.range, part, jnp.asarray([[0.1, np.pi / 4], [0.1, 3.0]]))
