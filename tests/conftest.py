@@ -13,7 +13,7 @@ from wholearm_jax.cli import app as command
 from wholearm_jax.core.config import configure
 
 MAPPED = 30_000  # half of the memory areas that Linux grants a process by default
-RESIDENT = 4 << 30  # memory of a worker [bytes], above which two of them leave little of 16 GiB to what tests start
+RESIDENT = 5 << 30  # memory of a worker [bytes], above which two of them leave little of 16 GiB to what tests start
 
 configure()
 gc.set_threshold(100_000, 20, 20)

@@ -33,7 +33,9 @@ class Geometry(NamedTuple):
 
 def quarter(a):
     """Vectors turned by +90 degrees."""
-    return np.stack([-a[..., 1], a[..., 0]], axis=-1)
+    turned = np.empty(a.shape)
+    turned[..., 0], turned[..., 1] = -a[..., 1], a[..., 0]
+    return turned
 
 
 def dot(a, b):
@@ -159,17 +161,14 @@ class Model:
         joint, side = joint[:, None], side[self.link][:, None, :, None]
         length, offset = length[:, None, :, None], offset[:, None, :, None]
         tip_on_edge = (self.kind == 1)[:, None]
-        r = np.take_along_axis(away, self.feature[:, None, :, None], axis=2)
-        after = np.take_along_axis(self.following(), self.feature, axis=1)
-        edge = np.take_along_axis(away, after[:, None, :, None], axis=2) - r
+        r = away[scene, :, self.feature].swapaxes(1, 2)
+        edge = away[scene, :, self.following()[scene, self.feature]].swapaxes(1, 2) - r
         extent = np.sqrt(dot(edge, edge))[..., None]
         edge = edge / np.where(extent > 0, extent, 1.0)
-        d = np.take_along_axis(directions, self.link[:, None, :, None], axis=2)
+        d = directions[scene, :, self.link].swapaxes(1, 2)
         q, q_dot, rate = z[..., None, :2], z_dot[..., None, :2], z_dot[..., None, 2]
         spins = np.concatenate([np.zeros_like(z_dot[..., :1]), z_dot[..., 3:]], axis=-1)
-        spin = np.take_along_axis(
-            spins, np.broadcast_to(self.link[:, None], (*z.shape[:2], self.link.shape[1])), axis=2
-        )
+        spin = spins[scene, :, self.link].swapaxes(1, 2)
         arm = length * d + offset * side * quarter(d)
 
         normal = np.where(tip_on_edge[..., None], quarter(edge), side * quarter(d))

@@ -91,11 +91,16 @@ class Model:
             formation=tuple(rows[None, :, k] for k in range(3)),
             tangential=rows[None, :, 3] > 0,
         )
-        self.normal = rows[:, 3] == 0
+        self.normal, self.last = rows[:, 3] == 0, (None, None)
         self.friction = self.contacts.friction[0, self.normal]
 
     def _geometry(self, z, z_dot):
-        return mechanics.Geometry(*(value[0, 0] for value in self.contacts.geometry(z[None, None], z_dot[None, None])))
+        """The contacts; kept for the next call, as the events of a step look at the same state one after the other."""
+        state = z.tobytes(), z_dot.tobytes()
+        if self.last[0] != state:
+            values = self.contacts.geometry(z[None, None], z_dot[None, None])
+            self.last = state, mechanics.Geometry(*(value[0, 0] for value in values))
+        return self.last[1]
 
     def geometry(self, z, z_dot):
         """Gaps, `G_n`, `G_t` and `G_n_dot z_dot` of all contacts."""
