@@ -108,8 +108,8 @@ def _find_hand(scene, text: str, wanted: dict[str, Any], limits: dict[str, Any],
     closing = sum(not math.isnan(trial.bound) for trial in found.trials)
     tried = f"of {len(found.trials)} hands {closing} close on the object, {planned} have a plan"
     chosen = found.scene if found.nearest is None else found.nearest
-    joint, finger = abs(float(chosen.hand.joint[0, 0])), float(chosen.hand.length[0])
-    dimensions = f"joints at -+{joint:.4g} m, fingers {finger:.4g} m long"
+    hand = chosen.hand
+    dimensions = f"joints at -+{abs(float(hand.joint[0, 0])):.4g} m, fingers {float(hand.length[0]):.4g} m long"
     if found.best is not None:
         outcome = f"the best: {dimensions}"
     elif found.nearest is not None:
