@@ -11,6 +11,7 @@ import pytest
 
 from wholearm_jax.cli import app as command
 from wholearm_jax.core.config import configure
+from wholearm_jax.core.executable_cache import MIN_CACHED_COMPILE_TIME
 
 MAPPED = 30_000  # half of the memory areas that Linux grants a process by default
 RESIDENT = 5 << 30  # memory of a worker [bytes], above which two of them leave little of 16 GiB to what tests start
@@ -44,7 +45,7 @@ def _programs_are_kept(request):
     cache = getattr(request.config, "cache", None)  # None where pytest keeps none
     if cache is not None and jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(cache.mkdir("programs") / "wholearm_jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_CACHED_COMPILE_TIME)
 
 
 @pytest.fixture(autouse=True)

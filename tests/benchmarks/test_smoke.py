@@ -8,6 +8,8 @@ from pathlib import Path
 import jax
 import pytest
 
+from wholearm_jax.core.executable_cache import MIN_CACHED_COMPILE_TIME
+
 ROOT = Path(__file__).parents[2]
 RUNS = {  # what each runs, after `import NAME as module`
     "batch": "module.COUNTS = (8, 8); run('--quick')",
@@ -87,7 +89,10 @@ def test_the_stability_sweep_runs_on_a_few_scenes(tmp_path):
 def run_apart(program, folder):
     """Run a program in a process of its own, with the programs that are kept; return what it prints."""
     paths = [str(ROOT / "benchmarks"), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    kept = {"JAX_COMPILATION_CACHE_DIR": str(jax.config.values["jax_compilation_cache_dir"])}
+    kept = {
+        "JAX_COMPILATION_CACHE_DIR": str(jax.config.values["jax_compilation_cache_dir"]),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(MIN_CACHED_COMPILE_TIME),
+    }
     environment = os.environ | kept | {"PYTHONPATH": os.pathsep.join(paths), "MPLBACKEND": "agg"}
     command = [sys.executable, "-c", program]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=1200)

@@ -13,7 +13,7 @@ import jax
 
 from wholearm_jax.core.program_cache import enable_program_cache
 
-MIN_CACHED_COMPILE_TIME = 0.05  # [s]
+MIN_CACHED_COMPILE_TIME = 0.0  # [s]: a process starts with dozens of small programs, which together take long
 _UNREADABLE_ENTRY = re.compile(r"Error reading persistent compilation cache entry for '([^']*)'")
 
 _own_folder: Path | None = None
