@@ -51,7 +51,7 @@ ABOVE = {
 """Which folders each folder may import from (`docs/architecture.md`)."""
 FOR_TYPES = {"files": ("execution",), "plotting": ("execution", "optimisation")}
 """Which more for annotations alone, under `TYPE_CHECKING`."""
-HEAVY = ("matplotlib", "mujoco", "zarr", "joblib", "jinja2", "rich", "ezdxf", "svgelements", "trimesh")
+HEAVY = ("matplotlib", "mujoco", "zarr", "joblib", "jinja2", "rich", "ezdxf", "svgelements", "trimesh", "scipy")
 
 
 def sources(package=PACKAGE):

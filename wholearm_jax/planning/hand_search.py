@@ -13,7 +13,6 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from scipy.optimize import minimize
 
 from wholearm_jax.core import as_device_array
 from wholearm_jax.model import Hand, Scene, edge_on_palm, link_overlaps, resting_configuration
@@ -157,6 +156,8 @@ def _improve_hand(scene: Scene, edge: int, planning: PlanningResult, proportions
             return np.inf
         moved = make_plan(changed, np.asarray(changed.start), best.steps, duration, planning.goal)
         return np.inf if moved is None else -moved.bound
+
+    from scipy.optimize import minimize  # imported here: it takes long to import
 
     begin, steps = np.array(proportions), np.array(spacing) / 2
     inward = np.where(begin + steps > np.array(ranges)[:, 1], -steps, steps)
