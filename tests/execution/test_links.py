@@ -94,6 +94,33 @@ def test_a_range_may_end_where_a_phase_does(crossing):
     }
 
 
+def test_a_tip_may_come_to_the_palm_where_a_phase_ends():
+    """A fingertip that slides along an edge down to the vertex on the palm touches both at once: no fault."""
+    finger = {"length": 0.064, "inertia": 6e-4, "viscous": 0.02, "dry": 0.01, "torque_limit": 2.0}
+    data = {
+        "title": "trapezoid",
+        "hand": {
+            "finger1": {"joint": [0.0814, 0.0], "offset": 0.00282, **finger},
+            "finger2": {"joint": [-0.0814, -0.005], **finger},
+        },
+        "object": {
+            "vertices": [[0.0, 0.0], [0.06729, 0.0], [0.04143, 0.0539], [0.0128, 0.0539]],
+            "mass": 0.05,
+            "friction": 0.2,
+        },
+        "gravity": 9.81,
+        "start": {"on": "e3", "x": -0.0034},
+        "phase": [
+            {"name": name, "contacts": ["palm:v0", "palm:v3", "finger1:e0", finger2], "toward": "x-", "duration": 0.3}
+            for name, finger2 in (("on", "finger2:e1"), ("down", "finger2:v2"))
+        ],
+    }
+    done = execute(wa.optimise(wa.parse(data)).result, timestep=1e-4)
+    assert "finger1 meets the palm" in done.link_contacts
+    assert done.ending is ExecutionOutcome.OK
+    assert unexpected_meetings(done.prediction, {"finger2 meets the palm"}) == {"finger2 meets the palm"}
+
+
 def test_a_tip_passes_round_the_other_fingers_end():
     """A box that is slid left: finger 1's tip, beyond the other finger's end at first, is above the object at last."""
     finger = {"length": 0.09, "inertia": 2e-3, "viscous": 0.02, "dry": 0.01, "torque_limit": 1.0}

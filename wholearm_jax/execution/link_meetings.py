@@ -8,10 +8,18 @@ from collections.abc import Collection
 import mujoco
 import numpy as np
 
+from wholearm_jax.core import as_device_array
 from wholearm_jax.execution.mujoco_model import MujocoModel
+from wholearm_jax.model import link_overlaps, object_radius
 from wholearm_jax.phases import Result
 
 RANGE_TOL = 1e-6  # [rad] from the end of a joint's range, within which a phase ends there
+TOUCH_TOL = 1e-6  # of the object's radius between links, within which they touch where a phase ends
+LINK_PAIRS = (
+    "finger1 meets finger2",
+    "finger1 meets the palm",
+    "finger2 meets the palm",
+)  # as `link_overlaps` has them
 
 
 def record_meetings(bodies: MujocoModel, data: mujoco.MjData, time: float, met: dict[str, float]) -> None:
@@ -30,13 +38,18 @@ def record_meetings(bodies: MujocoModel, data: mujoco.MjData, time: float, met: 
 def unexpected_meetings(prediction: Result, met: Collection[str]) -> set[str]:
     """Return those of the links that met, and of the ranges that ended, with which no phase of a prediction ends.
 
-    All are expected where a path ends at an obstacle. Otherwise a joint may reach its range where a phase ends.
+    All are expected where a path ends at an obstacle. Otherwise a joint may reach its range where a phase ends, and
+    links may touch there: a fingertip that slides along an edge down to the palm comes to a vertex and to the palm.
     """
     if any(bool(phase.traced.dynamics.ends_at_obstacle) for phase in prediction.phases):
         return set()
+    scene = prediction.scene
     ends = np.array([phase.traced.end[3:] for phase in prediction.phases])
-    reached = (np.abs(ends[..., None] - np.asarray(prediction.scene.hand.range)) < RANGE_TOL).any((0, 2))
-    return {*met} - {range_name(int(finger)) for finger in np.flatnonzero(reached)}
+    reached = (np.abs(ends[..., None] - np.asarray(scene.hand.range)) < RANGE_TOL).any((0, 2))
+    depths = np.array([link_overlaps(scene.hand, as_device_array(end))[:3] for end in ends])
+    touch = (depths > -TOUCH_TOL * object_radius(scene.object)).any(0)
+    expected = {range_name(int(finger)) for finger in np.flatnonzero(reached)}
+    return {*met} - expected - {LINK_PAIRS[pair] for pair in np.flatnonzero(touch)}
 
 
 def range_name(finger: int) -> str:

@@ -1,18 +1,19 @@
 """Plans: phases that lead to a goal, each with its certificate, and what a search for them returns."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from wholearm_jax.core import CachedJit, Status, as_device_array
-from wholearm_jax.margin import margin_upper_bound
+from wholearm_jax.margin import BOUND_PLACES, best_quasistatic_torque, margin_upper_bound
 from wholearm_jax.model import COORDINATES, Phase, Scene, contact_formation, path_target
 from wholearm_jax.phases import describe_end, find_hand_overs, trace
 from wholearm_jax.planning.goal import Goal
-
-_phase_bound = CachedJit(margin_upper_bound)
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,9 @@ def make_plan(
 ) -> Plan | None:
     """Trace steps as a plan at full resolution.
 
-    None where a phase cannot be traced, no torque survives a hand-over between two, the goal is missed, or the
-    certificate is not above the floor.
+    None where a phase cannot be traced, no torque survives a hand-over between two, or the certificate is not above the
+    floor; with a goal, also where it is missed, and where nothing holds the object at rest somewhere on the way: the
+    certificate looks at each place alone, and may be positive where no motion through all of them is.
     """
     planned = _as_scene(scene, start, steps, duration)
     traced = trace(planned)
@@ -112,10 +114,18 @@ def make_plan(
         return None
     bounds = np.full(len(steps), np.nan)
     for k in np.argsort([step.margin for step in steps]):  # the phase first that is likely to limit the plan
-        bounds[k] = float(_phase_bound(traced[k].dynamics, phases[k].duration).value)
-        if not bounds[k] > floor:
+        bounds[k], at_rest = map(float, _certificate(traced[k].dynamics, phases[k].duration))
+        if not bounds[k] > floor or (goal is not None and not at_rest > 0):
             return None
     return Plan(planned, steps, tuple(np.asarray(one.begin) for one in traced), ends, reasons, tuple(bounds.tolist()))
+
+
+@CachedJit
+def _certificate(dynamics, duration) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Compute the upper bound of a phase's margin, and the least of its margins at rest along the path [N]."""
+    places = dynamics.breakpoints[0] + dynamics.length * jnp.linspace(0.0, 1.0, BOUND_PLACES + 1)
+    at_rest = jax.vmap(partial(best_quasistatic_torque, dynamics))(places).margin
+    return margin_upper_bound(dynamics, duration).value, at_rest.min()
 
 
 def _as_scene(scene: Scene, start: Float[np.ndarray, "5"], steps: tuple[Step, ...], duration: float) -> Scene:
