@@ -13,9 +13,8 @@ from random_plans import random_plans
 
 import wholearm_jax as wa
 from wholearm_jax.core import as_device_array
-from wholearm_jax.margin import PROGRAMME_INTERVALS, rest_to_rest
+from wholearm_jax.margin import PROGRAMME_INTERVALS, largest_margin, rest_to_rest
 from wholearm_jax.model import replace_duration
-from wholearm_jax.optimisation import largest_margin
 
 
 def compare(scene: wa.Scene, seconds: float) -> list[str]:

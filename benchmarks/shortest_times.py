@@ -25,11 +25,10 @@ from toppra.constraint import LinearConstraint
 import wholearm_jax as wa
 from wholearm_jax.core import as_device_array
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
-from wholearm_jax.margin import PROGRAMME_INTERVALS, rest_to_rest
+from wholearm_jax.margin import PROGRAMME_INTERVALS, largest_margin, rest_to_rest, shortest_duration
 from wholearm_jax.margin.contact_forces import cone_facets
 from wholearm_jax.margin.path_programme import discretise
 from wholearm_jax.model import Arrival
-from wholearm_jax.optimisation.best_motion import largest_margin, shortest_duration
 from wholearm_jax.optimisation.quasistatic_plan import rolling_count
 
 SCENES = ("heptagon", "hexagon", "tipping", "box")

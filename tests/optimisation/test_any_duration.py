@@ -7,9 +7,8 @@ from support import layered
 
 import wholearm_jax as wa
 from wholearm_jax.core import as_device_array
-from wholearm_jax.margin import PROGRAMME_INTERVALS, rest_to_rest
+from wholearm_jax.margin import PROGRAMME_INTERVALS, largest_margin, rest_to_rest
 from wholearm_jax.model import path_target, replace_duration
-from wholearm_jax.optimisation import largest_margin
 from wholearm_jax.phases import trace
 
 LENGTHENED = (1.1, 1.5, 2.5, 6.0, 20.0, 100.0)  # durations over the shortest possible ones

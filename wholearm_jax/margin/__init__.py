@@ -12,7 +12,13 @@ from wholearm_jax.margin.contact_forces import (
     sampled_slacks,
 )
 from wholearm_jax.margin.exact_margin import MAX_REFINED, MarginResult, minimum_margin
-from wholearm_jax.margin.path_optimum import PROGRAMME_INTERVALS, PathOptimum, solve_path
+from wholearm_jax.margin.path_optimum import (
+    PROGRAMME_INTERVALS,
+    PathOptimum,
+    largest_margin,
+    shortest_duration,
+    solve_path,
+)
 from wholearm_jax.margin.path_programme import SpeedRange, rest_to_rest
 from wholearm_jax.margin.quasistatic import (
     acceleration_terms,

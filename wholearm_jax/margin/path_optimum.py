@@ -6,15 +6,18 @@ Derivation: section 8 of `docs/derivation.md`.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
+from wholearm_jax.core import LOOPS_AS_KERNELS, CachedJit, as_device_array
 from wholearm_jax.dynamics import PathDynamics, evaluate_dot, locate_panel
 from wholearm_jax.margin.chain_interior_point import ChainEffort, ChainSolution, lagrangian, solve_chain
 from wholearm_jax.margin.contact_forces import MAX_ROLLING
 from wholearm_jax.margin.path_programme import PathProgramme, SpeedRange, discretise
 
 PROGRAMME_INTERVALS = 200
+MORE_EFFORT = ChainEffort(iterations=600, to_boundary=0.9)
 
 
 class PathOptimum(eqx.Module):
@@ -76,6 +79,36 @@ def solve_path(
     best_margin = jnp.where(fast, margin, value * programme.force_unit)
     best_duration = jnp.where(fast, value, solution.duration) * programme.time_unit
     return _in_si_units(dynamics, programme, solution, best_margin, best_duration)
+
+
+def largest_margin(
+    dynamics: PathDynamics,
+    duration: Float[Array, ""],
+    speeds: SpeedRange,
+    rolling: int = MAX_ROLLING,
+    intervals: int = PROGRAMME_INTERVALS,
+) -> PathOptimum:
+    """Return the motion with the largest margin in a duration; see `solve_path`."""
+    return _solve(dynamics, duration, as_device_array(np.nan), speeds, intervals, rolling)
+
+
+def shortest_duration(
+    dynamics: PathDynamics, margin: Float[Array, ""], speeds: SpeedRange, rolling: int = MAX_ROLLING
+) -> PathOptimum:
+    """Return the fastest motion with a margin; see `solve_path`."""
+    return _solve(dynamics, as_device_array(np.inf), margin, speeds, PROGRAMME_INTERVALS, rolling)
+
+
+def _solve(*problem) -> PathOptimum:
+    """Solve a path's programme, with more effort where the usual one does not suffice."""
+    for effort in (ChainEffort(), MORE_EFFORT):
+        found = _solve_path(*problem, jax.tree.map(as_device_array, effort))
+        if found.converged:
+            break
+    return found
+
+
+_solve_path = CachedJit(solve_path, compiler_options=LOOPS_AS_KERNELS)
 
 
 def _in_si_units(dynamics: PathDynamics, p: PathProgramme, solution: ChainSolution, margin, duration) -> PathOptimum:

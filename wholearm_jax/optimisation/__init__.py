@@ -3,7 +3,7 @@
 `optimiser` explains how the parts work together."""
 
 from wholearm_jax.optimisation.advice import Search, explain
-from wholearm_jax.optimisation.best_motion import convex_bounds, largest_margin, shortest_motions
+from wholearm_jax.optimisation.best_motion import convex_bounds, shortest_motions
 from wholearm_jax.optimisation.margin_duration import Tradeoff, tradeoff
 from wholearm_jax.optimisation.optimiser import MIN_TRANSITION_SPEED, OptimisationResult, optimise
 from wholearm_jax.optimisation.plan_limits import certified_bounds

@@ -6,18 +6,14 @@ Derivation: section 8 of `docs/derivation.md`.
 
 from dataclasses import dataclass
 
-import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from wholearm_jax.core import LOOPS_AS_KERNELS, CachedJit, Status, as_device_array, require_x64
-from wholearm_jax.dynamics import PathDynamics
-from wholearm_jax.margin import PROGRAMME_INTERVALS, ChainEffort, PathOptimum, SpeedRange, solve_path
+from wholearm_jax.core import Status, as_device_array, require_x64
+from wholearm_jax.margin import PathOptimum, SpeedRange, largest_margin, shortest_duration
 from wholearm_jax.model import Arrival, Phase, Scene
 from wholearm_jax.optimisation.quasistatic_plan import rolling_count
 from wholearm_jax.phases import TracedPhase, starts_at_rest, trace
-
-MORE_EFFORT = ChainEffort(iterations=600, to_boundary=0.9)
 
 
 @dataclass(frozen=True)
@@ -112,33 +108,6 @@ def shortest_motions(
     return _each_phase(scene, traced, solve)
 
 
-def largest_margin(
-    dynamics: PathDynamics,
-    duration: Float[Array, ""],
-    speeds: SpeedRange,
-    rolling: int,
-    intervals: int = PROGRAMME_INTERVALS,
-) -> PathOptimum:
-    """Return the motion with the largest margin in a duration; see `solve_path`."""
-    return _solve(dynamics, duration, as_device_array(np.nan), speeds, intervals, rolling)
-
-
-def shortest_duration(
-    dynamics: PathDynamics, margin: Float[Array, ""], speeds: SpeedRange, rolling: int
-) -> PathOptimum:
-    """Return the fastest motion with a margin; see `solve_path`."""
-    return _solve(dynamics, as_device_array(np.inf), margin, speeds, PROGRAMME_INTERVALS, rolling)
-
-
-def _solve(*problem) -> PathOptimum:
-    """Solve a path's programme, with more effort where the usual one does not suffice."""
-    for effort in (ChainEffort(), MORE_EFFORT):
-        found = _solve_path(*problem, jax.tree.map(as_device_array, effort))
-        if found.converged:
-            break
-    return found
-
-
 def _each_phase(scene: Scene, traced, solve) -> tuple[BestMotion | None, ...]:
     """Solve the programme of each phase that moves the object."""
     require_x64(scene)
@@ -179,6 +148,3 @@ def _best_motion(path: TracedPhase, phase: Phase, optimum: PathOptimum) -> BestM
 
 def _places(optimum: PathOptimum):
     return optimum.node_s, optimum.point_s, optimum.hardest_s
-
-
-_solve_path = CachedJit(solve_path, compiler_options=LOOPS_AS_KERNELS)

@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from wholearm_jax.core import as_device_array
-from wholearm_jax.margin import PathOptimum, rest_to_rest
+from wholearm_jax.margin import PathOptimum, largest_margin, rest_to_rest, shortest_duration
 from wholearm_jax.model import Phase, Scene, TorqueSchedule, concatenate_schedules, torque_schedule
-from wholearm_jax.optimisation.best_motion import largest_margin, shortest_duration
 from wholearm_jax.optimisation.initial_guess import UnitMotion
 from wholearm_jax.optimisation.quasistatic_plan import rolling_count
 from wholearm_jax.optimisation.strong_hold import strong_hold

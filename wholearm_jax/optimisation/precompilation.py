@@ -5,9 +5,8 @@ import optax
 
 from wholearm_jax.core import BackgroundTask, as_device_array, compile_in_background
 from wholearm_jax.dynamics import placeholder_dynamics
-from wholearm_jax.margin import rest_to_rest
+from wholearm_jax.margin import largest_margin, rest_to_rest
 from wholearm_jax.model import Arrival, Scene
-from wholearm_jax.optimisation.best_motion import largest_margin
 from wholearm_jax.optimisation.constraints import Limits
 from wholearm_jax.optimisation.coupled_phases import (
     GUESS_TORQUE_FRACTION,

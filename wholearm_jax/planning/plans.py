@@ -9,11 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wholearm_jax.core import CachedJit, Status, as_device_array
-from wholearm_jax.margin import BOUND_PLACES, best_quasistatic_torque, margin_upper_bound
+from wholearm_jax.core import BackgroundTask, CachedJit, Status, as_device_array, compile_in_background
+from wholearm_jax.dynamics import placeholder_dynamics
+from wholearm_jax.margin import (
+    BOUND_PLACES,
+    best_quasistatic_torque,
+    largest_margin,
+    margin_upper_bound,
+    rest_to_rest,
+)
 from wholearm_jax.model import COORDINATES, Phase, Scene, contact_formation, path_target
 from wholearm_jax.phases import describe_end, find_hand_overs, trace
 from wholearm_jax.planning.goal import Goal
+from wholearm_jax.tracing import Resolution
 
 
 @dataclass(frozen=True)
@@ -49,7 +57,7 @@ class Plan:
     begins: tuple[np.ndarray, ...]  # `z` (SI) where each phase begins, and
     ends: tuple[np.ndarray, ...]  # ends
     reasons: tuple[str, ...]  # why each path ends
-    bounds: tuple[float, ...]  # upper bound of each phase's margin [N]
+    bounds: tuple[float, ...]  # upper bound of each phase's margin [N], of places alone and of motions the smaller one
 
     @property
     def bound(self) -> float:
@@ -98,8 +106,7 @@ def make_plan(
     """Trace steps as a plan at full resolution.
 
     None where a phase cannot be traced, no torque survives a hand-over between two, or the certificate is not above the
-    floor; with a goal, also where it is missed, and where nothing holds the object at rest somewhere on the way: the
-    certificate looks at each place alone, and may be positive where no motion through all of them is.
+    floor; with a goal, also where it is missed, and where nothing holds the object at rest somewhere on the way.
     """
     planned = _as_scene(scene, start, steps, duration)
     traced = trace(planned)
@@ -114,18 +121,40 @@ def make_plan(
         return None
     bounds = np.full(len(steps), np.nan)
     for k in np.argsort([step.margin for step in steps]):  # the phase first that is likely to limit the plan
-        bounds[k], at_rest = map(float, _certificate(traced[k].dynamics, phases[k].duration))
-        if not bounds[k] > floor or (goal is not None and not at_rest > 0):
+        problem = traced[k].dynamics, phases[k].duration
+        bounds[k], at_rest = map(float, _pointwise_margins(*problem))
+        if goal is not None and not at_rest > 0:
+            return None
+        if bounds[k] > floor:  # else the programme, which takes longer, can but say so again
+            bounds[k] = min(bounds[k], _best_margin(*problem))
+        if not bounds[k] > floor:
             return None
     return Plan(planned, steps, tuple(np.asarray(one.begin) for one in traced), ends, reasons, tuple(bounds.tolist()))
 
 
+def precompile_certificates() -> BackgroundTask:
+    """Compile what judges a plan's phases, in the background; returns the task to wait for."""
+    return compile_in_background(_judge_placeholder)
+
+
+def _judge_placeholder() -> None:
+    problem = placeholder_dynamics(Resolution()), as_device_array(1.0)
+    _pointwise_margins(*problem)
+    _best_margin(*problem)
+
+
 @CachedJit
-def _certificate(dynamics, duration) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Compute the upper bound of a phase's margin, and the least of its margins at rest along the path [N]."""
+def _pointwise_margins(dynamics, duration) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Compute the bound of a phase's margin that looks at each place alone, and the least margin at rest [N]."""
     places = dynamics.breakpoints[0] + dynamics.length * jnp.linspace(0.0, 1.0, BOUND_PLACES + 1)
     at_rest = jax.vmap(partial(best_quasistatic_torque, dynamics))(places).margin
     return margin_upper_bound(dynamics, duration).value, at_rest.min()
+
+
+def _best_margin(dynamics, duration) -> float:
+    """Return the largest margin of all motions along a path [N]; infinity where the programme has no optimum."""
+    best = largest_margin(dynamics, duration, rest_to_rest())
+    return float(best.margin) if bool(best.converged) else np.inf
 
 
 def _as_scene(scene: Scene, start: Float[np.ndarray, "5"], steps: tuple[Step, ...], duration: float) -> Scene:

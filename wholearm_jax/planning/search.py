@@ -23,7 +23,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from wholearm_jax.core import as_device_array, require_x64
+from wholearm_jax.core import BackgroundTask, as_device_array, require_x64, wait_for
 from wholearm_jax.model import (
     ANGLE_COORDINATES,
     AWAY_NAMES,
@@ -45,6 +45,7 @@ from wholearm_jax.planning.plans import (
     Step,
     contact_left,
     make_plan,
+    precompile_certificates,
     survives_hand_over,
 )
 from wholearm_jax.planning.regrasps import regrasp_stops, separate_regrasps
@@ -150,7 +151,7 @@ def plan(
     if vain:
         return PlanningResult(start, search.goal, (), None, f"no plan: {vain}", 0, 0, ())
     _push(search, start, (), touching)
-    out_of_time = _run(search, time_limit, max_nodes, callback)
+    out_of_time = _run(search, time_limit, max_nodes, callback, precompile_certificates())
     nearest, reason = None, ""
     again = functools.partial(_make_secure_plan, search)
     improved = [improve_plan(one, search.unit, again) for one in search.plans]
@@ -183,7 +184,11 @@ def _start(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
 
 
 def _run(
-    search: _Search, time_limit: float, max_nodes: int | None, callback: Callable[[int, float], None] | None
+    search: _Search,
+    time_limit: float,
+    max_nodes: int | None,
+    callback: Callable[[int, float], None] | None,
+    compiled: BackgroundTask,
 ) -> bool:
     """Expand configurations until nothing is left, plans no longer get better, or time is out; say whether it is."""
     begin = time.monotonic()
@@ -200,6 +205,7 @@ def _run(
             return True
         _expand(search, z, steps, names)
         if search.nodes == 1:  # the first expansion compiles: that is no time of the search
+            wait_for(compiled)
             begin = time.monotonic()
         if callback is not None:
             callback(search.nodes, search.nearest[0])
