@@ -122,7 +122,7 @@ def best_plan(scene: wa.Scene, ways: dict[tuple, Node], goal: Goal) -> Plan | No
     ordered = sorted(ways.values(), key=lambda way: -way.margin)
     for way in itertools.islice(ordered, TRIES):
         if best is not None and way.margin < best.bound:
-            break  # a certificate is not above the margin at rest
+            break  # the planner, whose search goes by margins at rest, leaves these out, too
         found = make_plan(scene, np.asarray(scene.start), way.steps, 1.0, goal)
         if found is not None and found.bound > 0 and (best is None or found.bound > best.bound):
             best = found

@@ -17,6 +17,7 @@ import wholearm_jax as wa
 from wholearm_jax.files import load_goal, load_start
 from wholearm_jax.files.scene_toml import SceneError, to_dict
 from wholearm_jax.model import COORDINATES, resting_configuration
+from wholearm_jax.optimisation import certified_bounds
 from wholearm_jax.planning.goal import make_goal
 from wholearm_jax.planning.improvement import is_secure
 from wholearm_jax.planning.move_stops import move_stops
@@ -60,9 +61,8 @@ def test_plans_arrive_when_traced_anew(part, turned):
 
 
 def certificates(scene):
-    """The smaller of two bounds of each phase's margin: over each place alone, and over all motions along its path."""
-    pointwise, motions = wa.bounds(scene), wa.convex_bounds(scene)
-    return [min(float(bound.value), best.margin) for bound, best in zip(pointwise, motions, strict=True)]
+    """What `optimise` compares its margins with."""
+    return [float(bound.value) for bound in certified_bounds(scene)]
 
 
 def test_a_trapezoid_slides_in_the_hand_that_is_chosen_for_it(tmp_path):

@@ -57,7 +57,7 @@ class Plan:
     begins: tuple[np.ndarray, ...]  # `z` (SI) where each phase begins, and
     ends: tuple[np.ndarray, ...]  # ends
     reasons: tuple[str, ...]  # why each path ends
-    bounds: tuple[float, ...]  # upper bound of each phase's margin [N], of places alone and of motions the smaller one
+    bounds: tuple[float, ...]  # largest margin of all motions along each phase's path [N]
 
     @property
     def bound(self) -> float:
@@ -122,11 +122,11 @@ def make_plan(
     bounds = np.full(len(steps), np.nan)
     for k in np.argsort([step.margin for step in steps]):  # the phase first that is likely to limit the plan
         problem = traced[k].dynamics, phases[k].duration
-        bounds[k], at_rest = map(float, _pointwise_margins(*problem))
+        pointwise, at_rest = map(float, _pointwise_margins(*problem))
         if goal is not None and not at_rest > 0:
             return None
-        if bounds[k] > floor:  # else the programme, which takes longer, can but say so again
-            bounds[k] = min(bounds[k], _best_margin(*problem))
+        best = largest_margin(*problem, rest_to_rest())
+        bounds[k] = float(best.margin) if bool(best.converged) else pointwise
         if not bounds[k] > floor:
             return None
     return Plan(planned, steps, tuple(np.asarray(one.begin) for one in traced), ends, reasons, tuple(bounds.tolist()))
@@ -140,7 +140,7 @@ def precompile_certificates() -> BackgroundTask:
 def _judge_placeholder() -> None:
     problem = placeholder_dynamics(Resolution()), as_device_array(1.0)
     _pointwise_margins(*problem)
-    _best_margin(*problem)
+    largest_margin(*problem, rest_to_rest())
 
 
 @CachedJit
@@ -149,12 +149,6 @@ def _pointwise_margins(dynamics, duration) -> tuple[Float[Array, ""], Float[Arra
     places = dynamics.breakpoints[0] + dynamics.length * jnp.linspace(0.0, 1.0, BOUND_PLACES + 1)
     at_rest = jax.vmap(partial(best_quasistatic_torque, dynamics))(places).margin
     return margin_upper_bound(dynamics, duration).value, at_rest.min()
-
-
-def _best_margin(dynamics, duration) -> float:
-    """Return the largest margin of all motions along a path [N]; infinity where the programme has no optimum."""
-    best = largest_margin(dynamics, duration, rest_to_rest())
-    return float(best.margin) if bool(best.converged) else np.inf
 
 
 def _as_scene(scene: Scene, start: Float[np.ndarray, "5"], steps: tuple[Step, ...], duration: float) -> Scene:

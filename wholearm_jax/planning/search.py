@@ -6,7 +6,7 @@ fractions later, as if they took a phase or two more (an object may be tipped fr
 search is best-first, by the number of phases and an estimate of those still needed, and drops moves whose margin is
 below the floor. Two orders take turns: by their sum, for plans of up to `SHORT_PLAN` phases, and with more weight on
 the estimate, which goes for a plan of any length. A plan that is found is traced anew, at full resolution, and judged
-by its certificate: the least upper bound of its phases.
+by its certificate: the least, over its phases, of the largest margins of all motions along their paths.
 Once there are as many plans as wanted, the floor rises to the least certificate among them, so that from then on only
 better ones count; the search ends when it has gone on as long again without finding one. Last, the places between the
 phases of the plans that are kept move until their certificates are as large as they get (`improve_plan`).
