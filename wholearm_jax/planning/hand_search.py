@@ -144,8 +144,8 @@ def _nearest(tried: Mapping[Any, tuple[HandTrial, Scene, PlanningResult | None]]
 def _improve_hand(scene: Scene, edge: int, planning: PlanningResult, proportions, ranges, spacing) -> list[float]:
     """Return the proportions with the largest certificate of a plan whose phases are held fixed.
 
-    The certificate is the least of all phases, places and contacts, with kinks just where it is largest: its slopes do
-    not lead there, so that the simplex method of Nelder and Mead (1965) is used.
+    The certificate is the least over phases and, in each, over contacts and places, with kinks just where it is
+    largest: its slopes do not lead there, so that the simplex method of Nelder and Mead (1965) is used.
     """
     best = planning.plans[0]
     duration = float(best.scene.phases[0].duration)
