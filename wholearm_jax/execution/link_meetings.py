@@ -9,17 +9,12 @@ import mujoco
 import numpy as np
 
 from wholearm_jax.core import as_device_array
-from wholearm_jax.execution.mujoco_model import MujocoModel
+from wholearm_jax.execution.mujoco_model import LINK_MEETINGS, MujocoModel
 from wholearm_jax.model import link_overlaps, object_radius
 from wholearm_jax.phases import Result
 
 RANGE_TOL = 1e-6  # [rad] from the end of a joint's range, within which a phase ends there
 TOUCH_TOL = 1e-6  # of the object's radius between links, within which they touch where a phase ends
-LINK_PAIRS = (
-    "finger1 meets finger2",
-    "finger1 meets the palm",
-    "finger2 meets the palm",
-)  # as `link_overlaps` has them
 
 
 def record_meetings(bodies: MujocoModel, data: mujoco.MjData, time: float, met: dict[str, float]) -> None:
@@ -49,7 +44,7 @@ def unexpected_meetings(prediction: Result, met: Collection[str]) -> set[str]:
     depths = np.array([link_overlaps(scene.hand, as_device_array(end))[:3] for end in ends])
     touch = (depths > -TOUCH_TOL * object_radius(scene.object)).any(0)
     expected = {range_name(int(finger)) for finger in np.flatnonzero(reached)}
-    return {*met} - expected - {LINK_PAIRS[pair] for pair in np.flatnonzero(touch)}
+    return {*met} - expected - {LINK_MEETINGS[pair] for pair in np.flatnonzero(touch)}
 
 
 def range_name(finger: int) -> str:

@@ -56,6 +56,7 @@ PAIR_DISTANCE = (
     1e-6  # gap at which contacts begin to act [object radii]: at 0 but for rounding, where objects start, all do
 )
 CORNER = 2e-3  # by how much finger and palm go on beyond the joint, and the finger beyond its tip [object radii]
+LINK_MEETINGS = ("finger1 meets finger2", "finger1 meets the palm", "finger2 meets the palm")  # rows of `link_overlaps`
 LINK_GIVE = 1e-3  # how far contacts between links give way, over those with the object
 EDGE_DEPTH = 0.02  # how deep a fingertip may sink in an edge [object radii]
 HALF_SPACE_DEPTH = 0.2  # slabs, and all shapes in depth [object radii]
@@ -295,11 +296,11 @@ def _gives_way(softness: ContactCompliance, timestep: float) -> dict[str, list[f
 def _add_link_pairs(spec, hand, size, timestep, softness) -> list[tuple[str, str, str]]:
     """Declare the pairs of links that may meet: (what meets, the dot, the slab)."""
     meetings = []
-    for k, name in enumerate(LINKS[1:]):
+    for k in (0, 1):
         dots = [dot for dot, _ in link_dots(hand, k)]
-        meetings += [(f"{name} meets the palm", tip, "palm") for tip in dots[1:]]
+        meetings += [(LINK_MEETINGS[1 + k], tip, "palm") for tip in dots[1:]]
         if not hand.layered:
-            meetings += [("finger1 meets finger2", dot, face) for dot in dots for face in link_faces(1 - k)]
+            meetings += [(LINK_MEETINGS[0], dot, face) for dot in dots for face in link_faces(1 - k)]
     for _, dot, slab in meetings:
         spec.add_pair(
             name=f"{dot} on {slab}",

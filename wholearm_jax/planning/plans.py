@@ -121,12 +121,10 @@ def make_plan(
         return None
     bounds = np.full(len(steps), np.nan)
     for k in np.argsort([step.margin for step in steps]):  # the phase first that is likely to limit the plan
-        problem = traced[k].dynamics, phases[k].duration
-        pointwise, at_rest = map(float, _pointwise_margins(*problem))
-        if goal is not None and not at_rest > 0:
+        dynamics = traced[k].dynamics
+        if goal is not None and not float(_least_rest_margin(dynamics)) > 0:
             return None
-        best = largest_margin(*problem, rest_to_rest())
-        bounds[k] = float(best.margin) if bool(best.converged) else pointwise
+        bounds[k] = _certificate(dynamics, phases[k].duration)
         if not bounds[k] > floor:
             return None
     return Plan(planned, steps, tuple(np.asarray(one.begin) for one in traced), ends, reasons, tuple(bounds.tolist()))
@@ -138,17 +136,25 @@ def precompile_certificates() -> BackgroundTask:
 
 
 def _judge_placeholder() -> None:
-    problem = placeholder_dynamics(Resolution()), as_device_array(1.0)
-    _pointwise_margins(*problem)
-    largest_margin(*problem, rest_to_rest())
+    dynamics = placeholder_dynamics(Resolution())
+    _least_rest_margin(dynamics)
+    largest_margin(dynamics, as_device_array(1.0), rest_to_rest())
 
 
 @CachedJit
-def _pointwise_margins(dynamics, duration) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Compute the bound of a phase's margin that looks at each place alone, and the least margin at rest [N]."""
+def _least_rest_margin(dynamics) -> Float[Array, ""]:
+    """Compute the least margin with which the object can be held at rest along a path [N]."""
     places = dynamics.breakpoints[0] + dynamics.length * jnp.linspace(0.0, 1.0, BOUND_PLACES + 1)
-    at_rest = jax.vmap(partial(best_quasistatic_torque, dynamics))(places).margin
-    return margin_upper_bound(dynamics, duration).value, at_rest.min()
+    return jax.vmap(partial(best_quasistatic_torque, dynamics))(places).margin.min()
+
+
+def _certificate(dynamics, duration) -> float:
+    """Return the largest margin of all motions along a path; without one, the bound of each place alone [N]."""
+    best = largest_margin(dynamics, duration, rest_to_rest())
+    return float(best.margin if best.converged else _pointwise_bound(dynamics, duration).value)
+
+
+_pointwise_bound = CachedJit(margin_upper_bound)
 
 
 def _as_scene(scene: Scene, start: Float[np.ndarray, "5"], steps: tuple[Step, ...], duration: float) -> Scene:

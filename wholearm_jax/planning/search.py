@@ -23,7 +23,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from wholearm_jax.core import BackgroundTask, as_device_array, require_x64, wait_for
+from wholearm_jax.core import as_device_array, require_x64, wait_for
 from wholearm_jax.model import (
     ANGLE_COORDINATES,
     AWAY_NAMES,
@@ -151,7 +151,7 @@ def plan(
     if vain:
         return PlanningResult(start, search.goal, (), None, f"no plan: {vain}", 0, 0, ())
     _push(search, start, (), touching)
-    out_of_time = _run(search, time_limit, max_nodes, callback, precompile_certificates())
+    out_of_time = _run(search, time_limit, max_nodes, callback)
     nearest, reason = None, ""
     again = functools.partial(_make_secure_plan, search)
     improved = [improve_plan(one, search.unit, again) for one in search.plans]
@@ -184,13 +184,10 @@ def _start(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
 
 
 def _run(
-    search: _Search,
-    time_limit: float,
-    max_nodes: int | None,
-    callback: Callable[[int, float], None] | None,
-    compiled: BackgroundTask,
+    search: _Search, time_limit: float, max_nodes: int | None, callback: Callable[[int, float], None] | None
 ) -> bool:
     """Expand configurations until nothing is left, plans no longer get better, or time is out; say whether it is."""
+    compiled = precompile_certificates()
     begin = time.monotonic()
     for z, steps, names in _next_entries(search):
         if steps and min(step.margin for step in steps) <= search.floor:  # the floor has risen
