@@ -48,6 +48,7 @@ def mechanics(scene: Scenes):
         dry=scene.dry,
         torque_limit=scene.torque_limit,
         layered=scene.layered,
+        clearance=jnp.zeros(()),
     )
     formation = ContactFormation(scene.link, scene.kind, scene.feature, scene.tangential)
     heading = PathTarget(scene.coordinate, scene.sign, scene.until_coordinate, scene.until_value)

@@ -107,6 +107,7 @@ def test_round_trip_of_everything_optional(tmp_path):
     data = heptagon()
     data["gravity"] = [0.3, -9.7]
     data["hand"]["finger1"]["offset"] = 1 / 300
+    data["hand"]["clearance"] = 1 / 3000
     data["object"] |= {"inertia": 1e-4 / 3, "center_of_mass": [1 / 700, -1 / 900]}
     data["object"]["friction"] = {"palm": 0.1, "finger1": 0.2, "finger2": 0.3}
     data["phase"][0] |= {"until": {"x": -0.01}, "arrive": "moving", "name": 'a "name" = with [signs] \u03b8'}
@@ -117,6 +118,7 @@ def test_round_trip_of_everything_optional(tmp_path):
     np.testing.assert_array_equal(scene.gravity, [0.3, -9.7])
     np.testing.assert_array_equal(scene.object.friction, [0.1, 0.2, 0.3])
     np.testing.assert_array_equal(scene.hand.offset, [1 / 300, 0.0])
+    assert float(scene.hand.clearance) == 1 / 3000
     assert scene.phases[1].formation.names[3] == "finger2:e4"
 
 
@@ -236,6 +238,7 @@ NUMBERS = [
     ((*FINGER1, "viscous", -1.0), "hand.finger1.viscous: must be greater than or equal to 0"),
     ((*FINGER1, "dry", NAN), "hand.finger1.dry: must be finite"),
     ((*FINGER2, "torque_limit", -1), "hand.finger2.torque_limit: must be greater than 0"),
+    (("hand", "clearance", -0.001), "hand.clearance: must be greater than or equal to 0"),
     ((*FINGER1, "joint", [NAN, 0.0]), "hand.finger1.joint[0]: must be finite"),
     ((*FINGER1, "joint", [0.08]), "hand.finger1.joint[1]: missing"),
     ((*FINGER1, "joint", [-0.1, 0.0]), "hand: finger 1 is the right one"),

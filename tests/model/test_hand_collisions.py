@@ -60,6 +60,23 @@ def test_depth_is_positive_where_polygons_overlap(hands):
     np.testing.assert_allclose(depths[:, 3:], beyond, atol=1e-15)
 
 
+def test_depth_is_positive_where_fingers_are_nearer_than_their_clearance(hands):
+    """Between a corner and a face the nearest distance; between two corners one up to the root of 2 larger counts."""
+    hand, angles = hands
+    clearance = 0.004
+    kept = eqx.tree_at(lambda h: h.clearance, hand, np.full(COUNT, clearance))
+    depths = np.asarray(depths_of(kept, angles))[:, 0]
+    near = np.zeros(COUNT, int)
+    for k in range(COUNT):
+        first, second = (finger_polygon(hand, k, f, float(angles[k, f])) for f in range(2))
+        distance = first.distance(second)
+        assert (depths[k] > 0) >= (distance < clearance)
+        assert (depths[k] > 0) <= (distance < np.sqrt(2) * clearance)
+        near[k] = 0 < distance < clearance
+    assert near.sum() > 5
+    np.testing.assert_allclose(depths - clearance, np.asarray(depths_of(hand, angles))[:, 0], atol=1e-15)
+
+
 def test_a_shift_by_the_depth_separates_two_strips(hands):
     """The depth is the least distance: no shift of less than it, in any of many directions, separates the fingers."""
     hand, angles = hands

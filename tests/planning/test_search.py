@@ -364,6 +364,14 @@ def test_a_start_at_which_links_overlap_says_which(part):
     assert other.nodes > 0
 
 
+def test_a_start_at_which_fingers_are_nearer_than_their_clearance_says_how_near(part):
+    near = eqx.tree_at(lambda s: s.hand.clearance, part, jnp.asarray(0.2))
+    found = wa.plan(near, by={"x": -0.01})
+    assert found.nodes == 0
+    assert " mm apart, of a clearance of 200 mm: search for a hand that fits" in found.reason
+    assert "give them less clearance" in found.reason
+
+
 def test_a_floor_for_the_margin_holds(part):
     assert not wa.plan(part, by={"phi": -0.35}, margin=5.0, max_phases=2).found
 

@@ -73,12 +73,15 @@ def test_end_is_where_a_tip_meets_the_other_finger(flip):
     np.testing.assert_allclose(end, curve_point(scene, met, end), atol=1e-10)
 
 
-def test_end_is_where_strips_begin_to_overlap(flip):
-    """Bisection of whether Shapely's rectangles intersect, for fingers with a thickness."""
+@pytest.mark.parametrize("clearance", [0.0, 0.0015])
+def test_end_is_where_strips_begin_to_overlap(flip, clearance):
+    """Bisection of whether Shapely's rectangles are as near as they may be, for fingers with a thickness."""
     scene, _ = flip
-    scene = eqx.tree_at(lambda s: (s.hand.offset, s.hand.back), scene, (jnp.array([0.002, 0.001]), jnp.full(2, 0.003)))
+    values = (jnp.array([0.002, 0.001]), jnp.full(2, 0.003), jnp.array(clearance))
+    scene = eqx.tree_at(lambda s: (s.hand.offset, s.hand.back, s.hand.clearance), scene, values)
     (traced,) = wa.trace(scene, tolerance=1e-3)  # the table is not looked at
     assert int(traced.path.end_reason) == PathEnd.OBSTACLE
+    assert ("(within their clearance of 1.5 mm)" in describe_end(scene, scene.phases[0], traced)) == (clearance > 0)
     begin, end = np.asarray(traced.begin), np.asarray(traced.end)
 
     def strip(z, k):
@@ -93,7 +96,7 @@ def test_end_is_where_strips_begin_to_overlap(flip):
     for _ in range(42):
         middle = (apart + met) / 2
         z = curve_point(scene, middle, end)
-        apart, met = (apart, middle) if strip(z, 0).intersects(strip(z, 1)) else (middle, met)
+        apart, met = (apart, middle) if strip(z, 0).distance(strip(z, 1)) <= clearance else (middle, met)
     assert abs(met - end[2]) < 0.04 * abs(ahead)
     np.testing.assert_allclose(end, curve_point(scene, met, end), atol=1e-10)
 
@@ -109,13 +112,13 @@ def test_a_phase_that_ends_at_an_obstacle_is_not_ok_and_names_it(flip):
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_gradient_of_the_end(flip, mode):
-    """With respect to lengths, joints, offsets, backs and vertices, for strips, against differences."""
+    """With respect to lengths, joints, offsets, backs, clearance and vertices, of strips, against differences."""
     scene, _ = flip
     scene = eqx.tree_at(lambda s: (s.hand.offset, s.hand.back), scene, (jnp.array([0.002, 0.001]), jnp.full(2, 0.003)))
     phase, weights = scene.phases[0], jnp.array([1.0, -2.0, 0.5, 0.3, -0.7])
 
     def chosen(s):
-        return (s.hand.length, s.hand.joint, s.hand.offset, s.hand.back, s.object.vertices)
+        return (s.hand.length, s.hand.joint, s.hand.offset, s.hand.back, s.hand.clearance, s.object.vertices)
 
     @jax.jit
     def end(values):
@@ -199,6 +202,22 @@ def test_a_start_with_crossing_fingers_is_refused_with_pair_and_depth():
     (line,) = describe_overlaps(scene, traced.begin)
     assert line.startswith("finger1 and finger2 cross, ")
     assert line.endswith(" mm deep")
+
+
+def test_fingers_nearer_than_their_clearance_are_named_with_their_distance(flip):
+    """No path begins there; shapely measures how near they are."""
+    scene, _ = flip
+    (traced,) = wa.trace(scene)
+    z = np.asarray(traced.begin)
+    ends = [np.asarray(scene.hand.joint[k]) for k in range(2)]
+    tips = [end + 0.14 * np.array([np.cos(z[3 + k]), np.sin(z[3 + k])]) for k, end in enumerate(ends)]
+    distance = 1e3 * shapely.LineString([ends[0], tips[0]]).distance(shapely.LineString([ends[1], tips[1]]))
+    near = eqx.tree_at(lambda s: s.hand.clearance, scene, jnp.array(1.1e-3 * distance))
+    (line,) = describe_overlaps(near, z)
+    assert line == f"finger1 and finger2 are {distance:.3g} mm apart, of a clearance of {1.1 * distance:.3g} mm"
+    assert int(wa.trace(near)[0].path.status) == wa.Status.OBSTACLE
+    far = eqx.tree_at(lambda s: s.hand.clearance, scene, jnp.array(0.9e-3 * distance))
+    assert describe_overlaps(far, z) == ()
 
 
 def test_layered_fingers_do_not_stop_the_path(flip):

@@ -42,6 +42,7 @@ def unexpected_meetings(prediction: Result, met: Collection[str]) -> set[str]:
     ends = np.array([phase.traced.end[3:] for phase in prediction.phases])
     reached = (np.abs(ends[..., None] - np.asarray(scene.hand.range)) < RANGE_TOL).any((0, 2))
     depths = np.array([link_overlaps(scene.hand, as_device_array(end))[:3] for end in ends])
+    depths[:, 0] -= float(scene.hand.clearance)  # free bodies touch or do not
     touch = (depths > -TOUCH_TOL * object_radius(scene.object)).any(0)
     expected = {range_name(int(finger)) for finger in np.flatnonzero(reached)}
     return {*met} - expected - {LINK_MEETINGS[pair] for pair in np.flatnonzero(touch)}

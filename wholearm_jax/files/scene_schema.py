@@ -69,6 +69,7 @@ class _Hand(_Strict):
     finger1: FingerTable
     finger2: FingerTable
     fingers: Literal["coplanar", "layered"] = "coplanar"
+    clearance: NonNegative = 0.0
 
     @model_validator(mode="after")
     def _sides(self) -> "_Hand":

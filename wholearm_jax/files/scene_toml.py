@@ -190,6 +190,7 @@ def _build(checked: SceneTables) -> Scene:
         hand=Hand(
             **{key: as_device_array([getattr(f, key) for f in fingers]) for key in FingerTable.model_fields},
             layered=as_device_array(checked.hand.fingers == "layered"),
+            clearance=as_device_array(checked.hand.clearance),
         ),
         object=polygon(shape.vertices, shape.mass, each, shape.inertia, shape.center_of_mass, shape.flush_tolerance),
         start=as_device_array([getattr(checked.start, c) for c in COORDINATES]),
@@ -212,7 +213,9 @@ def to_dict(scene: Scene) -> dict[str, Any]:
     fingers = [
         {key: np.asarray(getattr(scene.hand, key))[k].tolist() for key in FingerTable.model_fields} for k in range(2)
     ]
-    layers = {"fingers": "layered"} if bool(scene.hand.layered) else {}
+    between: dict[str, str | float] = {"fingers": "layered"} if bool(scene.hand.layered) else {}
+    if float(scene.hand.clearance):
+        between["clearance"] = float(scene.hand.clearance)
     shape = scene.object
     table = {
         "vertices": np.asarray(shape.vertices)[: int(shape.count)].tolist(),
@@ -228,7 +231,7 @@ def to_dict(scene: Scene) -> dict[str, Any]:
     return {
         "title": scene.title,
         "gravity": np.asarray(scene.gravity).tolist(),
-        "hand": {"finger1": fingers[0], "finger2": fingers[1]} | layers,
+        "hand": {"finger1": fingers[0], "finger2": fingers[1]} | between,
         "object": table,
         "start": dict(zip(COORDINATES, np.asarray(scene.start).tolist(), strict=True)),
         "phase": [_phase_dict(phase) for phase in scene.phases],

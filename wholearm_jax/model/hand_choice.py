@@ -115,6 +115,7 @@ def scaled_hand(span: float, length: float, mass: float) -> Hand:
         back=as_device_array([0.0, 0.0]),
         range=as_device_array([[0.0, np.pi]] * 2),
         layered=as_device_array(False),
+        clearance=as_device_array(0.0),
         **values,
     )
 

@@ -8,7 +8,8 @@ move apart or together first touch where a corner of one meets a face of the oth
   long faces. A finger and the palm's end beside its own joint are mounted on one another and never count as meeting.
 
 Both long faces of a finger are one row: the gap is measured from the strip's middle line, and a corner touches where it
-is half the strip's width, `half_width`, on either side. The ends of the joints' ranges complete the table; they are no
+is half the strip's width, `half_width`, on either side. Fingers that must keep a clearance meet where a corner of one
+comes to the other's strip widened and lengthened by it. The ends of the joints' ranges complete the table; they are no
 contacts, but linear in the joint angles.
 
 Derivation: section 3 of `docs/derivation.md`.
@@ -120,6 +121,7 @@ def link_obstacles(hand: Hand) -> LinkObstacles:
 
     # The point: a finger's corner, the palm's end, or of a tip's face the corner at which its edge begins.
     side = _SIDE[_POINT_LINK]
+    clearance = jnp.where(_ON_FINGER, hand.clearance, 0.0)
     tip_begins = jnp.stack([(middle - half_width)[0], -(middle + half_width)[1]])[_OTHER - 1]
     point_x = jnp.where(_PALM_END, hand.joint[_BESIDE - 1, 0], jnp.where(face, hand.length[_OTHER - 1], corner_reach))
     point_y = jnp.where(_PALM_END, 0.0, jnp.where(face, tip_begins, side * corner_height))
@@ -135,8 +137,8 @@ def link_obstacles(hand: Hand) -> LinkObstacles:
         offset=jnp.where(face, corner_height, line @ middle),
         point=(point_x * one, point_y * one),
         edge=(0 * one, one),
-        lower=jnp.where(face, 0.0, jnp.where(on_palm, palm_lower, jnp.where(_PALM_END, CORNER_TOL, 0.0))),
-        upper=jnp.where(face, width, jnp.where(on_palm, palm_upper, line_length)),
+        lower=jnp.where(on_palm, palm_lower, jnp.where(_PALM_END, CORNER_TOL, -clearance)),
+        upper=jnp.where(face, width, jnp.where(on_palm, palm_upper, line_length)) + clearance,
         friction=0 * one,
         tangential=one < 0,
         slides=one < 0,
@@ -150,8 +152,8 @@ def link_obstacles(hand: Hand) -> LinkObstacles:
         contacts=contacts,
         gap=jnp.where(_IS_ANGLE, 0.0, one),
         joint_angle=(jnp.asarray(sign * _of_finger(_LINK)[:, 0]), jnp.asarray(sign * _of_finger(_LINK)[:, 1])),
-        shift=jnp.asarray(-sign * limit),
-        half_width=jnp.where(two_sided, line @ half_width, 0.0),
+        shift=jnp.asarray(-sign * limit) - jnp.where(face, clearance, 0.0),
+        half_width=jnp.where(two_sided, line @ half_width + clearance, 0.0),
         two_sided=jnp.asarray(two_sided),
         exists=jnp.asarray(~_ON_FINGER) | ~hand.layered,
     )
@@ -173,8 +175,9 @@ def link_overlaps(hand: Hand, joint_angles: Float[Array, "2"]) -> Float[Array, "
         joint_angles: `theta1` and `theta2` (2,) [rad].
 
     Returns:
-        The depth of one finger in the other, of fingers 1 and 2 in the palm (in the hand's unit of length), and how far
-        joints 1 and 2 are beyond their ranges [rad]; negative where there is no overlap.
+        By how much the fingers lie in one another or are nearer than the hand's clearance, the depth of fingers 1 and 2
+        in the palm (all in the hand's unit of length), and how far joints 1 and 2 are beyond their ranges [rad];
+        negative where there is no overlap.
     """
     corners, axes, frames = jax.vmap(_strip)(hand.joint, *strip_middle(hand), hand.length, joint_angles, _SIDE[1:])
     # Separating axes of two rectangles: the faces of each.
@@ -183,7 +186,7 @@ def link_overlaps(hand: Hand, joint_angles: Float[Array, "2"]) -> Float[Array, "
         place = (corners[other] - hand.joint[own]) @ frames[own].T  # along the finger and across it
         low, high = jnp.stack([jnp.zeros(()), axes[own, 0]]), jnp.stack([hand.length[own], axes[own, 1]])
         separations += [place.min(0) - high, low - place.max(0)]
-    between = jnp.where(hand.layered, -jnp.inf, -jnp.concatenate(separations).max())
+    between = jnp.where(hand.layered, -jnp.inf, hand.clearance - jnp.concatenate(separations).max())
     palm = jax.vmap(_depth_below_palm, (None, 0, 0, 0))(hand, hand.joint, frames[:, 0], hand.length)
     tips = corners[:, 2:]
     beside = (tips[..., 0] > hand.joint[1, 0]) & (tips[..., 0] < hand.joint[0, 0])

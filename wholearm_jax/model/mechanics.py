@@ -93,6 +93,7 @@ def scaled_mechanics(
         dry=hand.dry / rotary,
         torque_limit=hand.torque_limit,
         layered=hand.layered,
+        clearance=hand.clearance / length,
     )
     pairs = obstacle_candidates(body.vertices.shape[0])
     touchable = pairs.feature < body.count

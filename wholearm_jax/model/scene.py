@@ -72,6 +72,7 @@ class Hand(eqx.Module):
     dry: Float[Array, "2"]  # D [N m]
     torque_limit: Float[Array, "2"]  # [N m]
     layered: Bool[Array, ""]  # whether the fingers lie in planes of their own and pass each other
+    clearance: Float[Array, ""]  # between fingers in one plane, which meet where they are nearer [m]
 
 
 class ContactFormation(eqx.Module):

@@ -42,11 +42,12 @@ def describe_obstacle(scene: Scene, z: Float[Array, "5"], row: int) -> str:
         return f"{finger} meets the palm at x = {float(_place(scene, z, row)):.4g} m"
     if obstacle.meeting == LinkMeeting.PALM_END_ON_FINGER:
         return f"{finger} meets the palm's end at finger{obstacle.palm_end}"
-    other = LINKS[3 - obstacle.link]
+    other, clearance = LINKS[3 - obstacle.link], float(scene.hand.clearance)
+    apart = f" (within their clearance of {1e3 * clearance:.3g} mm)" if clearance else ""
     if obstacle.on_tip_face:
-        return f"{finger} meets {other} at its tip"
+        return f"{finger} meets {other} at its tip{apart}"
     part = "" if obstacle.corner[0] else "'s joint"
-    return f"{finger}{part} meets {other} {float(_place(scene, z, row)):.3g} m from its joint"
+    return f"{finger}{part} meets {other} {float(_place(scene, z, row)):.3g} m from its joint{apart}"
 
 
 def _place(scene: Scene, z, row: int) -> float:
@@ -73,8 +74,12 @@ def describe_overlaps(scene: Scene, z: Float[Array | np.ndarray, "5"], tolerance
     radius = object_radius(scene.object)
     between, palm1, palm2, beyond1, beyond2 = (float(v) for v in link_overlaps(scene.hand, z[3:]))
     lines = []
-    if between > tolerance * radius:
-        lines.append(f"finger1 and finger2 cross, {1e3 * between:.3g} mm deep")
+    clearance = float(scene.hand.clearance)
+    if between - clearance > tolerance * radius:
+        lines.append(f"finger1 and finger2 cross, {1e3 * (between - clearance):.3g} mm deep")
+    elif between > tolerance * radius:
+        apart = max(clearance - between, 0.0)
+        lines.append(f"finger1 and finger2 are {1e3 * apart:.3g} mm apart, of a clearance of {1e3 * clearance:.3g} mm")
     for k, depth in enumerate((palm1, palm2)):
         if depth > tolerance * radius:
             lines.append(f"finger{k + 1} lies {1e3 * depth:.3g} mm below the palm's surface")

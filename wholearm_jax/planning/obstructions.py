@@ -52,9 +52,10 @@ def explain_vain_search(start: np.ndarray, goal: Goal, hand: Hand, overlaps: Seq
 
 def _advise_on_overlaps(overlaps: Sequence[str], hand: Hand) -> str:
     """Say what helps where links overlap at the start, or a joint is beyond its range."""
-    if any("cross" in line for line in overlaps):
+    if any("cross" in line or "clearance" in line for line in overlaps):
         search = f"search for a hand that fits, as with --hand-from {hand_ranges(hand)}"
-        return f"{search}, or let its fingers pass each other (layered)"
+        less = "give them less clearance, " if float(hand.clearance) else ""
+        return f"{search}, {less}or let its fingers pass each other (layered)"
     more_range = "give the joint more range, or " if any("range" in line for line in overlaps) else ""
     return f"{more_range}correct its pose and angles"
 
