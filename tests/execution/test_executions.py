@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -574,6 +575,15 @@ def test_who_goes_astray_open_loop_is_told_what_helps(wholearm, tmp_path):
     assert "open loop nothing corrects the object" in err
     assert "--timestep 0.0002" in err
     assert "wholearm optimise SCENE --feedback" in err
+
+
+def test_who_loses_contacts_open_loop_is_told_how_exact_torques_must_be(wholearm):
+    """More exact than a motor's: the schedule is right, and what a push changes nothing corrects."""
+    options = *TORQUE, "--push", "y=1@1.3", "--timestep", 5e-4
+    code, out, err = wholearm("execute", layered_file("heptagon"), *options)
+    assert code == 1
+    assert "executed: contact_lost" in out
+    assert re.search(r"torques would have to be right to 0\.\d+ %; a law does", err)
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,7 @@ def execute(
     else:
         _print_execution(execution, trials, folder)
     if law is None:
-        _note_astray(prediction, execution)
+        _note_open_loop(prediction, execution)
     else:
         _note_lost_contacts(law, hardware, trials)
     sys.exit(0 if ok else 1)
@@ -182,13 +182,19 @@ def _print_execution(execution, trials, folder: Path | None) -> None:
     print(f"executed: {execution.message}" + (f" -> {folder}" if folder else ""))
 
 
-def _note_astray(prediction, execution) -> None:
-    """Where the object goes astray without a law, say how exact torques must be, and what helps."""
-    from wholearm_jax.phases import torque_accuracy
+def _note_open_loop(prediction, execution) -> None:
+    """Where the object goes astray without a law, say how exact torques must be, and what helps.
 
-    if execution.ending.value != "astray":
+    Contacts are lost, and links meet, for that reason where torques must be more exact than a motor's.
+    """
+    from wholearm_jax.execution import ExecutionOutcome
+    from wholearm_jax.phases import MOTOR_ERROR, torque_accuracy
+
+    if execution.ending in (ExecutionOutcome.OK, ExecutionOutcome.DIVERGED):
         return
     accuracy = min((one for one in torque_accuracy(prediction) if one > 0), default=float("inf"))  # NaN left out
+    if execution.ending is not ExecutionOutcome.ASTRAY and accuracy >= MOTOR_ERROR:
+        return
     must = f", and torques would have to be right to {100 * accuracy:.2g} %" if accuracy < 1 else ""
     note(
         f"open loop nothing corrects the object{must}; a law does: wholearm optimise SCENE --feedback --out DIR,"
