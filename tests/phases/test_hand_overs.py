@@ -1,14 +1,16 @@
 """Hand-overs: where a vertex reaches a fingertip at rest, torques must do under either of the two contacts."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from reference.unreduced import Model
 
 import wholearm_jax as wa
+from wholearm_jax.cli.output import note_hand_overs
 from wholearm_jax.core import Status
-from wholearm_jax.phases import find_hand_overs, possible_hand_overs
+from wholearm_jax.phases import find_hand_overs, one_sided_torques, possible_hand_overs
 
 FINGER = {"length": 0.11, "inertia": 2e-3, "viscous": 0.02, "dry": 0.01, "torque_limit": 1.0}
 HAND = {f"finger{k}": FINGER | {"joint": [x, 0.0]} for k, x in ((1, 0.08), (2, -0.08))}
@@ -112,9 +114,59 @@ def test_a_torque_that_holds_by_one_contact_alone_holds_no_object(sliding):
         assert (second.holds[0].loss_time is None) == (status is None)
 
 
-def test_what_is_optimised_waits_by_either_contact(sliding):
+@pytest.fixture(scope="module")
+def optimum(sliding):
     scene, traced, _ = sliding
-    optimum = wa.optimise(scene, traced=traced)
+    return wa.optimise(scene, traced=traced)
+
+
+def with_torques_at_the_hand_over(result, stops, starts):
+    """A plan as it was simulated, beside a schedule with other torques before and after its hand-over."""
+    times, values = np.array(result.torque.times), np.array(result.torque.values)
+    rows = np.flatnonzero(abs(times - result.phases[1].start) < 1e-9)
+    waits = [held.end for held in result.phases[1].holds]
+    departs = np.flatnonzero(abs(times - max([result.phases[1].start, *waits])) < 1e-9)
+    values[rows[0]], values[departs[-1]] = stops, starts
+    return replace(result, torque=wa.torque_schedule(times, values))
+
+
+def test_torques_that_do_by_one_contact_alone_are_those_of_the_unreduced_equations(sliding, optimum):
+    """Who comes early is stopped by the contact that takes over, who comes late is started by the one that ends."""
+    _, traced, over = sliding
+    z, rng = np.array(traced[0].end), np.random.default_rng(4)
+    models = [Model(box_scene(), contacts) for contacts in (VERTICES, SLIDE["contacts"])]
+    tangents = [model.direction(z, "x+") for model in models]
+    counts = {True: [0, 0], False: [0, 0]}
+    for torque in rng.uniform(-1.0, 1.0, (60, 2)):
+        moved = [
+            m.solve(z, np.zeros(5), torque, np.sign(m.reversing(z, t))) for m, t in zip(models, tangents, strict=True)
+        ]
+        (_, late), (acceleration, early) = moved
+        goes_on = acceleration @ tangents[1] >= 0
+        lost = {True: bool(early.min() < 0 or goes_on), False: bool(late.min() < 0)}
+        found = one_sided_torques(with_torques_at_the_hand_over(optimum.result, torque, torque))
+        for stops, expected in lost.items():
+            match = [one for one in found if one.stops is stops]
+            assert len(match) == expected
+            counts[stops][expected] += 1
+            if match:
+                names = (over.before.name, over.after.name) if stops else (over.after.name, over.before.name)
+                assert (match[0].planned, match[0].other) == names
+                assert match[0].force == pytest.approx((early if stops else late).min(), rel=1e-6)
+    assert min(*counts[True], *counts[False]) > 3
+
+
+def test_torques_that_do_by_one_contact_alone_are_noted(sliding, optimum, capsys):
+    _, _, over = sliding
+    note_hand_overs(with_torques_at_the_hand_over(optimum.result, [-1.0, -1.0], over.best_motion(1.0).torque))
+    assert "the torques that stop the object at 1 s do so by finger2:v3 alone" in (err := capsys.readouterr().err)
+    assert "if it comes there a moment early, finger2:e3 holds it, and contacts are lost" in err
+    best = [over.best_motion(sign).torque for sign in (-1.0, 1.0)]
+    note_hand_overs(with_torques_at_the_hand_over(optimum.result, *best))
+    assert capsys.readouterr().err == ""
+
+
+def test_what_is_optimised_waits_by_either_contact(optimum):
     assert optimum.result.status is Status.OK, optimum.result.message
     assert all(held.margin > 0 for held in optimum.result.phases[1].holds)
 

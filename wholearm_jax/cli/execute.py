@@ -17,7 +17,7 @@ from wholearm_jax.cli.arguments import (
     refuse_unwritable,
 )
 from wholearm_jax.cli.interruption import quiet_workers
-from wholearm_jax.cli.output import may_replace
+from wholearm_jax.cli.output import may_replace, note_hand_overs
 from wholearm_jax.cli.prediction import read_controller_of, simulate_or_exit, trace_or_exit
 from wholearm_jax.cli.progress import count_progress
 from wholearm_jax.cli.tables import print_json
@@ -192,6 +192,7 @@ def _note_open_loop(prediction, execution) -> None:
 
     if execution.ending in (ExecutionOutcome.OK, ExecutionOutcome.DIVERGED):
         return
+    note_hand_overs(prediction)
     accuracy = min((one for one in torque_accuracy(prediction) if one > 0), default=float("inf"))  # NaN left out
     if execution.ending is not ExecutionOutcome.ASTRAY and accuracy >= MOTOR_ERROR:
         return

@@ -56,6 +56,7 @@ def write_result(
         print(result.message if not folder else f"{result.message} -> {folder}")
         if not law_is_asked_for:
             _note_accuracy(content)
+            note_hand_overs(result)
 
 
 def _note_accuracy(content: dict) -> None:
@@ -67,6 +68,19 @@ def _note_accuracy(content: dict) -> None:
         note(
             f"open loop, torques must be right to {100 * min(known):.2g} % for an end within {1e3 * END_POSITION:g} mm"
             f" and {END_ANGLE:g} rad; a law corrects what is wrong: wholearm optimise SCENE --feedback"
+        )
+
+
+def note_hand_overs(result) -> None:
+    """Say where torques hold an object at a hand-over by the planned contact alone, and what helps."""
+    from wholearm_jax.phases import one_sided_torques
+
+    for one in one_sided_torques(result):
+        moves, comes = ("stop", "early") if one.stops else ("start", "late")
+        note(
+            f"open loop, the torques that {moves} the object at {one.time:.4g} s do so by {one.planned} alone: if it"
+            f" comes there a moment {comes}, {one.other} holds it, and contacts are lost; a law does for both:"
+            " wholearm optimise SCENE --feedback"
         )
 
 

@@ -16,6 +16,7 @@ from wholearm_jax.phases.closed_loop_result import closed_loop_result
 from wholearm_jax.phases.compressive_margin import margin
 from wholearm_jax.phases.contact_opening import IMPULSE_ROUNDING, MAX_OPENING, ContactOpening, contact_opening
 from wholearm_jax.phases.gradients import check_gradient
+from wholearm_jax.phases.hand_over_torques import OneSidedTorque, one_sided_torques
 from wholearm_jax.phases.hand_overs import (
     HandOver,
     find_hand_over,
