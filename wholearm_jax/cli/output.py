@@ -77,9 +77,10 @@ def note_hand_overs(result) -> None:
 
     for one in one_sided_torques(result):
         moves, comes = ("stop", "early") if one.stops else ("start", "late")
+        ends = "contacts are lost" if one.force < 0 else "it does not stop"
         note(
             f"open loop, the torques that {moves} the object at {one.time:.4g} s do so by {one.planned} alone: if it"
-            f" comes there a moment {comes}, {one.other} holds it, and contacts are lost; a law does for both:"
+            f" comes there a moment {comes}, {one.other} holds it, and {ends}; a law does for both:"
             " wholearm optimise SCENE --feedback"
         )
 

@@ -4,13 +4,14 @@ An object that comes to a hand-over a moment early is stopped by the contact tha
 not quite there, is started by the contact that ends. The simulation, which is never early or late, sees neither.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from wholearm_jax.core import Status
-from wholearm_jax.model import TorqueSchedule
+from wholearm_jax.margin import schedule_corners
 from wholearm_jax.phases.hand_overs import OneContact, find_hand_overs
 from wholearm_jax.phases.result import Result
 
@@ -38,15 +39,19 @@ def one_sided_torques(result: Result) -> tuple[OneSidedTorque, ...]:
         return ()
     found = []
     traced = tuple(phase.traced for phase in result.phases)
-    for phase, over in zip(result.phases, find_hand_overs(result.scene, traced), strict=True):
+    overs = find_hand_overs(result.scene, traced)[1:]
+    for (last, phase), over in zip(itertools.pairwise(result.phases), overs, strict=True):
         if over is None:
             continue
-        start = max([phase.start, *(held.end for held in phase.holds if held.start <= phase.start)])
-        for stops, time, planned, other in (
-            (True, phase.start, over.before, over.after),
-            (False, start, over.after, over.before),
+        begin = phase.start
+        departs = max([begin, *(held.end for held in phase.holds if held.start <= begin)])
+        stopping = schedule_corners(result.torque, last.start, begin)[1][-1]
+        starting = schedule_corners(result.torque, departs, begin + phase.duration)[1][0]
+        for stops, time, torque, planned, other in (
+            (True, begin, stopping, over.before, over.after),
+            (False, departs, starting, over.after, over.before),
         ):
-            force, acceleration = _motion(other, _torque_beside(result.torque, time, before=stops))
+            force, acceleration = _motion(other, torque)
             if force < 0 or (stops and acceleration >= 0):
                 found.append(OneSidedTorque(time, stops, planned.name, other.name, force))
     return tuple(found)
@@ -56,13 +61,3 @@ def _motion(one: OneContact, torque: Float[np.ndarray, "2"]) -> tuple[float, flo
     """Return the least force [N] and the acceleration of an object that moves ahead, held by a contact."""
     row = np.append(1.0, torque)
     return float((one.slack @ row).min()), float(one.accelerations.ahead @ row)
-
-
-def _torque_beside(schedule: TorqueSchedule, time: float, *, before: bool) -> Float[np.ndarray, "2"]:
-    """Return a schedule's torque just before or just after a time [s], where it may step."""
-    times, values = np.asarray(schedule.times), np.asarray(schedule.values)
-    near = abs(times - time) <= 1e-9 * times[-1]
-    if near.any():
-        rows = np.flatnonzero(near)
-        return values[rows[0] if before else rows[-1]]
-    return np.array([np.interp(time, times, column) for column in values.T])
