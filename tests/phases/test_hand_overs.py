@@ -10,7 +10,7 @@ from reference.unreduced import Model
 import wholearm_jax as wa
 from wholearm_jax.cli.output import note_hand_overs
 from wholearm_jax.core import Status
-from wholearm_jax.phases import find_hand_overs, one_sided_torques, possible_hand_overs
+from wholearm_jax.phases import STARTS, STOPS, find_hand_overs, one_sided_torques, possible_hand_overs
 
 FINGER = {"length": 0.11, "inertia": 2e-3, "viscous": 0.02, "dry": 0.01, "torque_limit": 1.0}
 HAND = {f"finger{k}": FINGER | {"joint": [x, 0.0]} for k, x in ((1, 0.08), (2, -0.08))}
@@ -95,6 +95,37 @@ def test_no_torque_of_a_grid_does_better(sliding, sign):
     assert best.margin - 0.5 < max(margins) < best.margin + 0.5  # as coarse as the grid is; it asks for no surplus
 
 
+def linear_in_torque(z, contacts):
+    """Acceleration along the path and forces of the un-reduced equations at rest, linear in `(1, tau1, tau2)`."""
+    model = Model(box_scene(), contacts)
+    tangent = model.direction(z, "x+")
+    sign = np.sign(model.reversing(z, tangent))
+    solved = [model.solve(z, np.zeros(5), torque, sign) for torque in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0])]
+    rows = np.array([np.append(acceleration @ tangent, forces) for acceleration, forces in solved]).T
+    rows[:, 1:] -= rows[:, :1]
+    return rows[0], rows[1:]
+
+
+@pytest.mark.parametrize("sign", [STARTS, STOPS], ids=["start", "arrival"])
+def test_the_best_by_the_planned_contact_that_serves_by_the_other(sliding, sign):
+    """Torques of a grid serve where the un-reduced equations say so, and none of them does better."""
+    _, traced, over = sliding
+    both = [linear_in_torque(np.array(traced[0].end), contacts) for contacts in (VERTICES, SLIDE["contacts"])]
+    (_, planned), (ahead, other) = both if sign == STOPS else both[::-1]
+    grid = np.linspace(-1.0, 1.0, 201)
+    torques = np.stack([np.ones(grid.size**2), *(a.ravel() for a in np.meshgrid(grid, grid))])
+
+    serves = (other @ torques).min(0) >= 0.5 * over.best_motion(sign).margin
+    if sign == STOPS:
+        serves &= -(ahead @ torques) / np.linalg.norm(ahead[1:]) >= 0.03
+    np.testing.assert_array_equal((over.unplanned_rows(sign) @ torques).min(0) >= 0, serves)
+    assert 0.01 < serves.mean() < 0.9
+
+    best, of_grid = over.planned_margin(sign), (planned @ torques).min(0)[serves].max()
+    assert over.best_motion(sign).margin <= best
+    assert best - 0.1 < of_grid < best + 1e-9  # as coarse as the grid is
+
+
 def test_a_torque_that_holds_by_one_contact_alone_holds_no_object(sliding):
     """While the object waits at the hand-over, the margin is that of the contact that holds it less well."""
     scene, traced, over = sliding
@@ -164,6 +195,29 @@ def test_torques_that_do_by_one_contact_alone_are_noted(sliding, optimum, capsys
     best = [over.best_motion(sign).torque for sign in (-1.0, 1.0)]
     note_hand_overs(with_torques_at_the_hand_over(optimum.result, *best))
     assert capsys.readouterr().err == ""
+
+
+def test_what_is_optimised_serves_by_either_contact(sliding, optimum):
+    """An object that comes up to a hundredth of the motion early or late meets torques that move it as planned."""
+    z = np.array(sliding[1][0].end)
+    first, second = optimum.result.phases
+    early, late = (Model(box_scene(), contacts) for contacts in (SLIDE["contacts"], VERTICES))
+    times, values = np.array(optimum.torque.times), np.array(optimum.torque.values)
+    begin, departs = (max([phase.start, *(held.end for held in phase.holds)]) for phase in (first, second))
+    end = second.start + second.duration
+
+    def moved(model, moments):
+        tangent = model.direction(z, "x+")
+        for moment in moments:
+            torque = [np.interp(moment, times, column) for column in values.T]
+            acceleration, forces = model.solve(z, np.zeros(5), torque, np.sign(model.reversing(z, tangent)))
+            yield acceleration @ tangent, forces.min()
+
+    for along, least in moved(early, second.start - (second.start - begin) * np.linspace(1e-9, 0.01, 7)):
+        assert along < 0 < least
+    for _, least in moved(late, departs + (end - departs) * np.linspace(1e-9, 0.01, 7)):
+        assert least > 0
+    assert one_sided_torques(optimum.result) == ()
 
 
 def test_what_is_optimised_waits_by_either_contact(optimum):

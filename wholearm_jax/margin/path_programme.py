@@ -23,6 +23,7 @@ from wholearm_jax.margin.contact_forces import MAX_ROLLING, cone_facets
 
 GRADING = 0.5  # 0: nodes evenly spaced in each segment; 1: at Chebyshev's places, dense at its ends
 MIN_INTERVALS = 2  # of a segment
+SHORT_SEGMENT = 1e-6  # of the path, below which a segment has no intervals of its own: they would be mere rounding
 LEAST_UNIT = 1e-3  # of force, over the largest that torques at their limits exert
 SPEED_CAP = 100.0  # largest b in units of path length times largest acceleration, where nothing else limits it
 
@@ -158,15 +159,24 @@ class _Grid(NamedTuple):
 
 
 def _grid(dynamics: PathDynamics, intervals: int) -> _Grid:
-    """Divide each segment, with nodes that are dense at its ends."""
+    """Divide each segment, with nodes that are dense at its ends.
+
+    Intervals of the next segment cover one that is too short, those of the last one what follows it. Its sides stay:
+    what must hold where a motion begins or ends holds there.
+    """
     each = jnp.arange(dynamics.first.shape[0])
     live = each < dynamics.count
     low, high = dynamics.breakpoints[:-1], dynamics.breakpoints[1:]
-    first, count = _allocate(jnp.where(live, high - low, 0.0), live, intervals)
+    length = jnp.where(live, high - low, 0.0)
+    divided = length > SHORT_SEGMENT * length.sum()
+    first, count = _allocate(jnp.where(divided, length, 0.0), divided, intervals)
+    covered = jax.lax.cummax(jnp.where(divided, high, low[0]))  # up to the end of each segment
+    start = jnp.append(low[0], covered[:-1])
+    stop = jnp.where(covered == covered[-1], dynamics.breakpoints[dynamics.count], high)
     interval = jnp.arange(intervals)
     owner = (interval[:, None] >= (first + count)[None, :]).sum(1)
     begin, end = (
-        low[owner] + (high - low)[owner] * _graded((interval + k - first[owner]) / count[owner]) for k in (0, 1)
+        start[owner] + (stop - start)[owner] * _graded((interval + k - first[owner]) / count[owner]) for k in (0, 1)
     )
     ratio = jnp.cumprod(jnp.where(live, dynamics.speed_ratio, 1.0))
     segment = jnp.concatenate([owner, each, each])
@@ -181,13 +191,13 @@ def _grid(dynamics: PathDynamics, intervals: int) -> _Grid:
     )
 
 
-def _allocate(length, live, intervals: int):
+def _allocate(length, divided, intervals: int):
     """First interval and number of intervals of each segment: in proportion to its length, all in all `intervals`."""
-    least = jnp.where(live, MIN_INTERVALS, 0)
+    least = jnp.where(divided, MIN_INTERVALS, 0)
     spare = intervals - least.sum()
     count = least + jnp.floor(spare * length / length.sum()).astype(int)
     count = count.at[jnp.argmax(length)].add(intervals - count.sum())
-    return jnp.cumsum(count) - count, jnp.maximum(count, jnp.where(live, 1, 0))
+    return jnp.cumsum(count) - count, count
 
 
 def _graded(x):

@@ -41,6 +41,7 @@ class Limits(eqx.Module):
     min_transition_speed: Float[Array, ""]  # of phases that start moving [path lengths a duration]
     fixed_torques: Bool[Array, "phases knots"]  # knots whose torques stay as they are
     force_scale: Float[Array, "phases"]  # unit of forces [N]
+    hand_over: Float[Array, "phases intervals rows 5"]  # `hand_over_rows`
 
 
 def _has_phase_axis(limits: Limits) -> Limits:
@@ -61,9 +62,9 @@ def force_count(knots: int) -> int:
     return samples_per_part(knots - 1) * SLACKS_PER_SAMPLE
 
 
-def inequality_count(knots: int) -> int:
-    """Return the number of inequalities of a part: forces, torques, torque rates, speeds, durations."""
-    return force_count(knots) + 8 + 4 + SPEED_COEFFICIENTS + 2
+def inequality_count(knots: int, hand_over: int = 0) -> int:
+    """Return the number of inequalities of a part: forces, torques, torque rates, speeds, durations, hand-overs."""
+    return force_count(knots) + 8 + 4 + SPEED_COEFFICIENTS + 2 + hand_over
 
 
 def evaluate_constraints(
@@ -92,9 +93,10 @@ def evaluate_constraints(
         owner = results.interval_of_part
         is_first = jnp.arange(owner.size) < intervals
         part_min_speed = jnp.where(is_first, min_speed[owner], 0.0)
-        each_part = jax.vmap(partial(_part_inequalities, intervals), (0, 0, 0, 0, None, None))
+        each_part = jax.vmap(partial(_part_inequalities, intervals), (0, 0, 0, 0, 0, None, None))
         limits = eqx.combine(of_phase, shared)
-        inequality, weight = each_part(q[owner], results.parts, is_first, part_min_speed, dynamics, limits)
+        rows = limits.hand_over[owner]
+        inequality, weight = each_part(q[owner], results.parts, is_first, part_min_speed, rows, dynamics, limits)
         return ConstraintValues(inequality, results.end), (stop_gradient(weight), owner)
 
     return jax.lax.map(one_phase, (q, min_speed, phase_dynamics, of_phase))
@@ -106,13 +108,14 @@ def _part_inequalities(
     part: PartSamples,
     is_first,
     min_speed,
+    hand_over: Float[Array, "rows 5"],
     dynamics: PathDynamics,
     limits: Limits,
 ) -> tuple[Float[Array, "inequalities"], Float[Array, "inequalities"]]:
     """Return the inequalities of one part of an interval, and their weights.
 
     Those that do not depend on the part belong to the interval's first one. `min_speed` is the least speed with which
-    the part may begin, -inf where it starts at rest.
+    the part may begin, -inf where it starts at rest, and `hand_over` the interval's `hand_over_rows`.
     """
     torque, log_duration = q[2:6], q[6]
 
@@ -138,8 +141,10 @@ def _part_inequalities(
     once = is_first / intervals
     rate_weight = jnp.tile(jnp.where(rate_limited, once / 4, 0.0), 2)
     duration_weight = jnp.full(2, jnp.where(is_free, once / 4, 0.0))
-    values = [force, 1 - torque, 1 + torque, 1 - rate, 1 + rate, speed, duration]
-    weights = [force_weight, jnp.full(8, once / 4), rate_weight, speed_weight, duration_weight]
+    either = hand_over @ jnp.append(1.0, torque)
+    either_weight = jnp.where(jnp.any(hand_over != 0, 1), once / 4, 0.0)
+    values = [force, 1 - torque, 1 + torque, 1 - rate, 1 + rate, speed, duration, either]
+    weights = [force_weight, jnp.full(8, once / 4), rate_weight, speed_weight, duration_weight, either_weight]
     return jnp.concatenate(values), jnp.concatenate(weights)
 
 

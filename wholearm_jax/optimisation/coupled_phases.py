@@ -31,6 +31,7 @@ from wholearm_jax.model import (
 )
 from wholearm_jax.optimisation.constraints import Limits
 from wholearm_jax.optimisation.convex_start import ConvexStart, Wait, wait_before
+from wholearm_jax.optimisation.hand_over_limits import hand_over_rows
 from wholearm_jax.optimisation.initial_guess import initial_guesses
 from wholearm_jax.optimisation.interior_point import interior_point
 from wholearm_jax.optimisation.multiple_shooting import extra_parts
@@ -80,6 +81,7 @@ class OptimiseOptions:
     knots: int  # of each phase, and
     most_knots: int  # of one in which so few cost margin
     schedule_rows: int  # of the whole plan's schedule: plans with equal rows share programs
+    hand_over_rows: int  # of each interval
     steps: int
     rate_limit: float | None
     durations: tuple[float, float] | None
@@ -105,6 +107,7 @@ class CoupledPhases:
     begin: RestTransition | None  # to the first phase, where torque rates are limited and another stands before
     end: RestTransition | None  # from the last phase
     hand_over: HandOver | None  # with which the first one begins
+    next_hand_over: HandOver | None  # with which the last one ends
     convex: ConvexStart | None  # of a single phase
     tries_profile: bool  # whether a smooth motion is tried as well
     first_guess: int  # number of the first initial guess
@@ -213,7 +216,7 @@ def _solve_from_guesses(
     """Solve from guesses in turn; returns the best solution, and the records of all iterations."""
     options, limits, stacked = group.options, _limits(group), stack_dynamics([path.dynamics for path in group.traced])
     problem = Problem(group.index, stacked, group.bounds, limits, options.steps, options.tolerance)
-    method = solver_method(options.optimiser, len(group.phases), extra_parts(stacked))
+    method = solver_method(options.optimiser, len(group.phases), extra_parts(stacked), options.hand_over_rows)
     candidates: list[_Candidate] = []
     history: list[IterationRecord] = []
     for number, guess in enumerate(guesses, group.first_guess):
@@ -301,14 +304,19 @@ def _limits(group: CoupledPhases) -> Limits:
     for at in group.fixed_torques:
         is_fixed[at] = True
     shortest, unit = np.maximum(shortest, MIN_DURATION_FRACTION * longest), np.maximum(group.bounds, 1e-300)
-    values = rate, shortest, longest, np.asarray(options.passing), is_fixed, unit
+    begin = None if is_fixed[0, 0] else group.hand_over
+    end = None if is_fixed[-1, -1] else group.next_hand_over
+    rows = hand_over_rows(begin, end, len(times), options.knots - 1, options.hand_over_rows)
+    values = rate, shortest, longest, np.asarray(options.passing), is_fixed, unit, rows
     return Limits(*(as_device_array(a) for a in values))
 
 
 @functools.cache
-def solver_method(optimiser, phases: int, further_parts: int):
+def solver_method(optimiser, phases: int, further_parts: int, hand_over_rows: int):
     """Return one transformation for every use, so that programs are not compiled again."""
-    return interior_point(phases, further_parts) if optimiser is None else projected_gradient(optimiser)
+    if optimiser is None:
+        return interior_point(phases, further_parts, hand_over_rows)
+    return projected_gradient(optimiser)
 
 
 stack_dynamics = jax.jit(stack_trees)

@@ -62,17 +62,18 @@ class _Direction(NamedTuple):
     equality_multipliers: Float[Array, "e"]  # values, not changes
 
 
-def interior_point(phases: int, extra_parts: int) -> optax.GradientTransformationExtraArgs:
+def interior_point(phases: int, extra_parts: int, hand_over_rows: int = 0) -> optax.GradientTransformationExtraArgs:
     """Build the transformation; its `update` needs `linear` and `regularisation`, and ignores the gradient.
 
     Args:
         phases: number of phases.
         extra_parts: number of parts that intervals may have beyond one each (`multiple_shooting.extra_parts`).
+        hand_over_rows: number of those of each interval.
     """
 
     def init(params):
         knots = knot_count(params.shape[0], phases)
-        shape = (phases, knots - 1 + extra_parts, inequality_count(knots))
+        shape = (phases, knots - 1 + extra_parts, inequality_count(knots, hand_over_rows))
         level, mu, mu_min = (jnp.full((), value) for value in (jnp.nan, MU_MAX, MU_MIN))
         owner = jnp.zeros(shape[:2], int)
         return InteriorPointState(

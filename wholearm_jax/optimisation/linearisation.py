@@ -18,7 +18,6 @@ from wholearm_jax.optimisation.constraints import (
     evaluate_constraints,
     fixed_variables,
     force_count,
-    inequality_count,
     linkage_defects,
 )
 from wholearm_jax.optimisation.variables import (
@@ -112,7 +111,7 @@ def linearise(
         inequality=values.inequality,
         inequality_jacobian=derivatives.inequality,
         weight=weight,
-        margin_mask=jnp.asarray((np.arange(inequality_count(knots)) < force_count(knots)) * 1.0),
+        margin_mask=jnp.asarray((np.arange(values.inequality.shape[2]) < force_count(knots)) * 1.0),
         interval_of_part=owner,
         defect=jnp.concatenate([defect, linkage(flat)]),
         equality_jacobian=jnp.concatenate([jacobian, jax.jacfwd(linkage)(flat)]),

@@ -68,7 +68,13 @@ from wholearm_jax.optimisation.coupled_phases import (
     schedule_rows,
     solve_coupled_phases,
 )
-from wholearm_jax.optimisation.plan_limits import limit_by_hand_overs, tighten_bounds, too_short_phases
+from wholearm_jax.optimisation.hand_over_limits import hand_over_row_count
+from wholearm_jax.optimisation.plan_limits import (
+    limit_by_hand_overs,
+    margins_by_either_contact,
+    tighten_bounds,
+    too_short_phases,
+)
 from wholearm_jax.optimisation.plan_transitions import holding_schedule, rest_transitions
 from wholearm_jax.optimisation.precompilation import precompile_optimise
 from wholearm_jax.optimisation.quasistatic_plan import DEFAULT_KNOTS, bounds, require_knots
@@ -119,7 +125,14 @@ class PlanLimits(NamedTuple):
     pointwise: tuple[MarginBound, ...]  # of each phase
     bounds: tuple[MarginBound, ...]  # the smaller of that and the convex one
     hand_overs: list[HandOver | None]  # with which the phases begin
+    by_either: np.ndarray  # largest margins [N] that the hand-overs at their ends leave
     too_short: dict[int, float]  # shortest duration [s] of each phase that has less time
+
+    def reachable(self, phase: int) -> MarginBound:
+        """Return the bound of a phase, or the margin that the hand-overs at its ends leave where that is smaller."""
+        bound = self.bounds[phase]
+        least = min(float(bound.value), self.by_either[phase])
+        return eqx.tree_at(lambda of: of.value, bound, as_device_array(least))
 
 
 @on_host("optimise outside, and transform wholearm_jax.margin with the schedule")
@@ -216,13 +229,16 @@ def optimise(
         pointwise,
         limit_by_hand_overs(tighten_bounds(scene, pointwise, motions, traced), hand_overs, traced),
         hand_overs,
+        margins_by_either_contact(hand_overs),
         too_short_phases(longest, pointwise, motions, traced),
     )
 
     refines = knots is None and rate_limit is None and optimiser is None
-    counts = first_knots, MOST_KNOTS if refines else first_knots, schedule_rows(len(scene.phases), first_knots)
+    most_knots = MOST_KNOTS if refines else first_knots
+    rows = schedule_rows(len(scene.phases), first_knots), hand_over_row_count(scene, first_knots)
     heard = callback and _one_at_a_time(callback)
-    options = OptimiseOptions(*counts, steps, rate_limit, durations, passing, optimiser, tolerance, heard)
+    further = steps, rate_limit, durations, passing, optimiser, tolerance, heard
+    options = OptimiseOptions(first_knots, most_knots, *rows, *further)
     results = []
     for max_dwell in MAX_DWELLS if rate_limit is not None else MAX_DWELLS[:1]:
         results.append(_solve_plan(scene, traced, limits, options, max_dwell))
@@ -249,7 +265,8 @@ def _solve_plan(
         solutions = list(threads.map(solve_group, groups, itertools.pairwise([None, *transitions, None])))
     schedules = [schedule for found in solutions for schedule in found.schedules]
     schedules = [_without_idle_torques(*each) for each in zip(scene.phases, schedules, strict=True)]
-    stopped = [found.reason for found in solutions for _ in found.schedules]
+    reasons = [found.reason for found in solutions for _ in found.schedules]
+    stopped = [_with_hand_over(reason, limits, k) for k, reason in enumerate(reasons)]
     history = [record for found in solutions for record in found.history]
 
     # Simulate the whole plan.
@@ -282,9 +299,9 @@ def _solve_group(
     if short:
         schedules = [uniform_schedule(float(phase.duration), np.zeros((options.knots, 2))) for phase in phases]
         return GroupSolution(schedules, f"phase '{scene.phases[short[0]].name}' is too short for any motion", [])
-    margin_bounds: list[MarginBound] = [limits.bounds[k] for k in group]
-    hand_over = limits.hand_overs[group[0]]
-    coupled = partial(CoupledPhases, group[0], phases, paths, margin_bounds, *ends, hand_over)
+    margin_bounds = [limits.reachable(k) for k in group]
+    hand_over, next_hand_over = limits.hand_overs[group[0]], [*limits.hand_overs, None][group[-1] + 1]
+    coupled = partial(CoupledPhases, group[0], phases, paths, margin_bounds, *ends, hand_over, next_hand_over)
     if len(group) > 1 or int(paths[0].dynamics.status) != Status.OK or not float(margin_bounds[0].value) > 0:
         return solve_coupled_phases(scene, coupled(None, True, 0, options))
 
@@ -308,6 +325,15 @@ def _solve_group(
             break
     best = max(solutions, key=lambda found: found.score)
     return best._replace(history=[record for found in solutions for record in found.history])
+
+
+def _with_hand_over(reason: str, limits: PlanLimits, phase: int) -> str:
+    """Add to why iterations ended what the hand-overs at a phase's ends leave of its bound."""
+    left = limits.by_either[phase]
+    if left >= GOOD_BOUND_FRACTION * float(limits.bounds[phase].value):
+        return reason
+    most = f"{left:.4g} N, the most with which torques serve by either contact of its hand-over"
+    return reason.replace("the bound", most) if "the bound" in reason else f"{reason}; there are at most {most}"
 
 
 def _without_idle_torques(phase: Phase, schedule: TorqueSchedule) -> TorqueSchedule:

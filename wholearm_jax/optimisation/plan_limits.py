@@ -7,12 +7,15 @@ that begins with a hand-over that no torque survives, it is the hand-over's marg
 
 from collections.abc import Sequence
 
+import numpy as np
+from jaxtyping import Float
+
 from wholearm_jax.core import as_device_array
 from wholearm_jax.margin import MarginBound
 from wholearm_jax.model import Arrival, Scene
 from wholearm_jax.optimisation.best_motion import BestMotion, convex_bounds, shortest_motions
 from wholearm_jax.optimisation.quasistatic_plan import bounds
-from wholearm_jax.phases import HandOver, TracedPhase, find_hand_overs, starts_at_rest, trace
+from wholearm_jax.phases import STARTS, STOPS, HandOver, TracedPhase, find_hand_overs, starts_at_rest, trace
 
 
 def certified_bounds(
@@ -77,6 +80,19 @@ def limit_by_hand_overs(
         return MarginBound(*(as_device_array(a) for a in (margin, path.dynamics.range()[0], 0.0)))
 
     return tuple(limited(*row) for row in zip(margin_bounds, hand_overs, traced, strict=True))
+
+
+def margins_by_either_contact(hand_overs: Sequence[HandOver | None]) -> Float[np.ndarray, "phases"]:
+    """Return the largest margin of each phase [N] whose torques serve by either contact of the hand-overs at its ends.
+
+    It is infinite for a phase without, and where no torque serves at all, which `limit_by_hand_overs` says.
+    """
+    left = np.full(len(hand_overs), np.inf)
+    for k, over in enumerate(hand_overs):
+        if over is not None and over.margin > 0:
+            for phase, sign in ((k - 1, STOPS), (k, STARTS)):
+                left[phase] = min(left[phase], over.planned_margin(sign))
+    return left
 
 
 def too_short_phases(

@@ -14,6 +14,7 @@ from wholearm_jax.optimisation.coupled_phases import (
     solver_method,
     stack_dynamics,
 )
+from wholearm_jax.optimisation.hand_over_limits import hand_over_row_count
 from wholearm_jax.optimisation.initial_guess import initial_guesses
 from wholearm_jax.optimisation.iteration import init_solver, take_step
 from wholearm_jax.optimisation.multiple_shooting import extra_parts
@@ -32,7 +33,8 @@ def precompile_optimise(
     sizes = sorted({len(group) for group in group_phases(scene) if scene.phases[group[0]].arrive is not Arrival.HOLD})
     rolling = sorted({rolling_count(p) for p in scene.phases if p.arrive is not Arrival.HOLD})
     guesses = compile_in_background(_compile_guesses, tuple(sizes), tuple(rolling), knots)
-    steps = [compile_in_background(_compile_step, n, knots, optimiser) for n in sizes]
+    rows = hand_over_row_count(scene, knots)
+    steps = [compile_in_background(_compile_step, n, knots, rows, optimiser) for n in sizes]
     options = with_step_capacity(IntegratorOptions(), knots)
     return (
         guesses,
@@ -51,12 +53,12 @@ def _compile_guesses(sizes: tuple[int, ...], rolling: tuple[int, ...], knots: in
         initial_guesses([dynamics] * phases, np.ones(phases), knots, GUESS_TORQUE_FRACTION)
 
 
-def _compile_step(phases: int, knots: int, optimiser: optax.GradientTransformation | None) -> None:
-    """Take one step of the solver on placeholders."""
+def _compile_step(phases: int, knots: int, rows: int, optimiser: optax.GradientTransformation | None) -> None:
+    """Take one step of the solver on placeholders, with so many `hand_over_rows`."""
     phase_dynamics = stack_dynamics([placeholder_dynamics(Resolution())] * phases)
-    method = solver_method(optimiser, phases, extra_parts(phase_dynamics))
-    each = np.ones(phases)
-    values = (np.full(2, np.inf), each, each, np.zeros(()), np.zeros((phases, knots), bool), each)
+    method = solver_method(optimiser, phases, extra_parts(phase_dynamics), rows)
+    each, is_fixed, hand_over = np.ones(phases), np.zeros((phases, knots), bool), np.zeros((phases, knots - 1, rows, 5))
+    values = (np.full(2, np.inf), each, each, np.zeros(()), is_fixed, each, hand_over)
     limits = Limits(*(as_device_array(a) for a in values))
     empty = (np.zeros((phases, knots, 2)), np.zeros((phases, knots, 2)), np.zeros(phases))
     p = Variables(*(as_device_array(a) for a in empty))

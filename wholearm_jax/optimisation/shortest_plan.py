@@ -8,7 +8,8 @@ import equinox as eqx
 from wholearm_jax.core import Status
 from wholearm_jax.model import Scene, replace_duration
 from wholearm_jax.optimisation.best_motion import convex_bounds, shortest_motions
-from wholearm_jax.phases import TracedPhase
+from wholearm_jax.optimisation.plan_limits import margins_by_either_contact
+from wholearm_jax.phases import TracedPhase, find_hand_overs
 
 if TYPE_CHECKING:
     from wholearm_jax.optimisation.optimiser import OptimisationResult
@@ -34,12 +35,16 @@ def shortest_plan(
         ValueError: where a phase reaches the margin in no duration, or no schedule was found that does.
     """
     fastest = shortest_motions(scene, margin, traced=traced)
-    for phase, motion, best in zip(
-        scene.phases, fastest, convex_bounds(scene, any_duration=True, traced=traced), strict=True
-    ):
+    largest = convex_bounds(scene, any_duration=True, traced=traced)
+    by_either = margins_by_either_contact(find_hand_overs(scene, traced))
+    for phase, motion, best, left in zip(scene.phases, fastest, largest, by_either, strict=True):
+        reached = None
         if motion is not None and best is not None and not (motion.feasible and best.margin >= margin):
-            reached = f"at most {best.margin:.4g} N" if best.feasible else "none"
-            raise ValueError(f"no motion of phase '{phase.name}' has a margin of {margin:g} N: {reached} in any time")
+            reached = f"at most {best.margin:.4g} N in any time" if best.feasible else "none in any time"
+        elif left < margin:
+            reached = f"torques that serve by either contact of its hand-over reach {left:.4g} N"
+        if reached is not None:
+            raise ValueError(f"no motion of phase '{phase.name}' has a margin of {margin:g} N: {reached}")
     tried = [0] * len(fastest)
     while max(tried) < len(STRETCHES):
         phases = (

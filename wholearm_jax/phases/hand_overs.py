@@ -36,6 +36,8 @@ from wholearm_jax.phases.phase_tracing import TracedPhase
 
 POINT_TOL = 1e-6  # distance of a tip from a vertex, in the object's radius, at which the two are one point
 LEAST_SURPLUS = 0.03  # of the torques that brake or move the object, over the limits, beyond those that only balance
+UNPLANNED_SHARE = 0.5  # of the best margin by either contact, with which torques press the one that is not planned
+STOPS, STARTS = -1.0, 1.0  # what torques do at a hand-over: signs of their surplus
 
 
 class OneContact(NamedTuple):
@@ -61,7 +63,7 @@ class HandOver(NamedTuple):
     @property
     def margin(self) -> float:
         """The smaller of the largest margins with which the object arrives and starts [N]; negative: it cannot."""
-        return min(self.best_motion(sign).margin for sign in (-1.0, 1.0))
+        return min(self.best_motion(sign).margin for sign in (STOPS, STARTS))
 
     def best_hold(self) -> StaticMargin:
         """Compute the torque that holds the object by either contact with the largest margin.
@@ -84,7 +86,7 @@ class HandOver(NamedTuple):
         return self._margin(level, programme.maximise("apart") or best)
 
     def best_motion(self, sign: float) -> StaticMargin:
-        """Compute the torque that starts (1) or stops (-1) the object with the largest margin by either contact."""
+        """Compute the torque that starts or stops the object with the largest margin by either contact."""
         programme, limit = self._programme()
         for prefix, one in zip(("before_", "after_"), self, strict=True):
             slack, surplus = one.slack / self.before.statics.unit, sign * one.surplus_row(limit)
@@ -94,6 +96,35 @@ class HandOver(NamedTuple):
         if best is None:
             return StaticMargin(-np.inf, self.after.name, np.zeros(2))
         return self._margin(float(best.values["level"][0]), best)
+
+    def unplanned_rows(self, sign: float) -> Float[np.ndarray, "rows 3"]:
+        """Return what must not be negative where torques start or stop the object by the contact of another phase.
+
+        An object that arrives a moment early is held by the contact that takes over, one that is late by the contact
+        that ends. Torques that stop it must press and brake it then as well, those that start it must press it.
+
+        Returns:
+            Rows linear in 1 and the torques over their limits; empty where no torque does by either contact.
+        """
+        best, limit = self.best_motion(sign).margin, self.before.statics.torque_limit
+        if not best > 0:
+            return np.zeros((0, 3))
+        other = self.after if sign == STOPS else self.before
+        force = other.slack * np.append(1.0, limit) / self.before.statics.unit
+        force[:, 0] -= UNPLANNED_SHARE * best / self.before.statics.unit
+        if sign == STARTS:
+            return force
+        return np.vstack([force, sign * other.surplus_row(limit) - [LEAST_SURPLUS, 0.0, 0.0]])
+
+    def planned_margin(self, sign: float) -> float:
+        """Compute the largest margin by the planned contact [N] of torques that respect `unplanned_rows`."""
+        programme, limit = self._programme()
+        planned, rows = self.before if sign == STOPS else self.after, self.unplanned_rows(sign)
+        slack = planned.slack / self.before.statics.unit
+        programme.at_least("forces", -slack[:, 0], torque=slack[:, 1:] * limit, level=-1.0)
+        programme.at_least("unplanned", -rows[:, 0], torque=rows[:, 1:])
+        best = programme.maximise("level")
+        return -np.inf if best is None else float(best.values["level"][0]) * self.before.statics.unit
 
     def _programme(self) -> tuple[LinearProgramme, Float[np.ndarray, "2"]]:
         """Begin a programme: torques over their limits, and the margin over the unit of force."""
@@ -126,14 +157,25 @@ def find_hand_over(
 
 def hand_over_contacts(scene: Scene, before: Phase, path: TracedPhase, after: Phase) -> tuple[str, str] | None:
     """Name the contact that ends and the one that takes over from it at the same point, at rest; None without any."""
-    at_rest = before.arrive in (Arrival.AT_REST, Arrival.ANY_SPEED) and after.arrive is not Arrival.HOLD
-    if not at_rest or before.regrasp or after.regrasp or int(path.dynamics.status) != Status.OK:
+    if int(path.dynamics.status) != Status.OK:
         return None
-    held, then = (tuple(map(feature_pair, phase.formation.names)) for phase in (before, after))
-    for old, new, vertex in possible_hand_overs(held, then, int(scene.object.count)):
+    for old, new, vertex in _hand_overs_by_name(scene, before, after):
         if _tip_to_vertex(scene, path.end, parse_contact(old)[0] - 1, vertex) < POINT_TOL:
             return old, new
     return None
+
+
+def may_hand_over(scene: Scene, before: Phase, after: Phase) -> bool:
+    """Whether the contacts of two phases allow a hand-over between them, wherever the path ends."""
+    return any(True for _ in _hand_overs_by_name(scene, before, after))
+
+
+def _hand_overs_by_name(scene: Scene, before: Phase, after: Phase) -> Iterator[tuple[str, str, int]]:
+    """Yield `possible_hand_overs` between two phases; none where they do not meet at rest, or regrasp."""
+    at_rest = before.arrive in (Arrival.AT_REST, Arrival.ANY_SPEED) and after.arrive is not Arrival.HOLD
+    if at_rest and not before.regrasp and not after.regrasp:
+        held, then = (tuple(map(feature_pair, phase.formation.names)) for phase in (before, after))
+        yield from possible_hand_overs(held, then, int(scene.object.count))
 
 
 def possible_hand_overs(before: Sequence[str], after: Sequence[str], vertices: int) -> Iterator[tuple[str, str, int]]:
