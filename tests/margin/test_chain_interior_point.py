@@ -12,6 +12,7 @@ import wholearm_jax as wa
 from wholearm_jax.margin import chain_interior_point, path_programme
 from wholearm_jax.margin.chain_constraints import duration, inequalities
 from wholearm_jax.margin.path_programme import SpeedRange, rest_to_rest
+from wholearm_jax.phases import configuration
 
 INTERVALS = 80
 discretise = jax.jit(path_programme.discretise, static_argnames="intervals")
@@ -92,6 +93,26 @@ def test_solutions_are_feasible_and_margin_and_time_are_one_curve(paths):
 def test_what_no_torque_can_do_does_not_converge(paths):
     found = solve(programme(paths["hexagon", 1], 0.05))
     assert not bool(found.converged)
+
+
+@pytest.mark.parametrize("distance", [1e-9, 1e-7, 1e-5])
+def test_a_start_next_to_a_reversal_has_the_margin_of_a_start_at_it(distance):
+    """The first segment is shorter than any interval should be: one of mere rounding is not divided."""
+    scene = wa.load("heptagon")
+    dynamics = wa.trace(scene)[0].dynamics
+
+    def best(s):
+        z = configuration(dynamics, jnp.asarray(0), s)
+        (path,) = wa.trace(eqx.tree_at(lambda of: (of.start, of.phases), scene, (z, scene.phases[:1])))
+        p = programme(path.dynamics)
+        found = solve(p)
+        assert bool(found.converged)
+        return int(path.dynamics.count), float(found.unknowns.m * p.force_unit)
+
+    kink = dynamics.breakpoints[1]
+    (count, margin), (whole, beyond) = best(kink - distance), best(kink + 1e-9)
+    assert (count, whole) == (2, 1)
+    assert margin == pytest.approx(beyond, rel=1e-6 + 2 * distance)
 
 
 def test_margins_converge_with_the_square_of_the_interval(paths):
