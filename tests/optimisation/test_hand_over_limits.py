@@ -8,7 +8,7 @@ import pytest
 import wholearm_jax as wa
 from wholearm_jax.core import Status
 from wholearm_jax.optimisation.hand_over_limits import EARLY_OR_LATE, hand_over_row_count, hand_over_rows
-from wholearm_jax.phases import STARTS, STOPS, HandOver, find_hand_overs, one_sided_torques
+from wholearm_jax.phases import STARTING, STOPPING, HandOver, find_hand_overs, one_sided_torques
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -26,7 +26,7 @@ def test_rows_hold_where_torques_serve_at_all_times_near_the_hand_over(braked, m
     """The least row of a phase is that of the torque, interpolated between knots, at the worst of many times."""
     scene, _, over = braked
     rng = np.random.default_rng(3)
-    rows = {sign: rng.normal(size=(5, 3)) for sign in (STARTS, STOPS)}
+    rows = {sign: rng.normal(size=(5, 3)) for sign in (STARTING, STOPPING)}
     monkeypatch.setattr(HandOver, "unplanned_rows", lambda _, sign: rows[sign])
     placed = hand_over_rows(over, over, 2, knots - 1, hand_over_row_count(scene, knots))
     times, torque = np.linspace(0.0, 1.0, knots), rng.normal(size=(2, knots, 2))
@@ -35,7 +35,7 @@ def test_rows_hold_where_torques_serve_at_all_times_near_the_hand_over(braked, m
     least = np.where(np.any(placed != 0, 3), values, np.inf).min((1, 2))
 
     near = np.linspace(0.0, EARLY_OR_LATE, 501)  # with all knots
-    for phase, sign, moments in ((0, STARTS, near), (1, STOPS, 1 - near)):
+    for phase, sign, moments in ((0, STARTING, near), (1, STOPPING, 1 - near)):
         at = np.stack([np.ones(near.size), *(np.interp(moments, times, column) for column in torque[phase].T)])
         np.testing.assert_allclose(least[phase], (rows[sign] @ at).min(), atol=1e-12)
 
@@ -46,7 +46,7 @@ def test_plans_without_hand_overs_have_no_rows():
 
 def test_what_a_hand_over_leaves_is_reached_and_said(braked):
     scene, traced, over = braked
-    left = over.planned_margin(STOPS)
+    left = over.planned_margin(STOPPING)
     assert 0 < left < 0.5 * wa.convex_bounds(scene, traced=traced)[0].margin
     optimum = wa.optimise(scene, traced=traced)
     assert optimum.result.status is Status.OK, optimum.result.message
@@ -59,6 +59,6 @@ def test_what_a_hand_over_leaves_is_reached_and_said(braked):
 
 def test_a_margin_beyond_what_a_hand_over_leaves_is_refused_by_its_number(braked):
     scene, traced, over = braked
-    reached = f"torques that serve by either contact of its hand-over reach {over.planned_margin(STOPS):.4g} N"
+    reached = f"torques that serve by either contact of its hand-over reach {over.planned_margin(STOPPING):.4g} N"
     with pytest.raises(ValueError, match=f"no motion of phase 'vertex' has a margin of 0.4 N: {reached}"):
         wa.optimise(scene, margin=0.4, traced=traced)

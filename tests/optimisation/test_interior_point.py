@@ -43,9 +43,9 @@ def problem():
     limits = force_count(KNOTS) + np.arange(8)
     jacobian[:, limits, 2:6], constant[:, limits] = np.vstack([-np.eye(4), np.eye(4)]), 1.0
     weight[:, :FORCES], weight[:, limits] = step / FORCES, step / 32
-    one = jnp.ones(1)
+    one, no_rows = jnp.ones(1), jnp.zeros((1, INTERVALS, 0, 5))
     fixed = jnp.zeros((1, KNOTS), bool)
-    is_fixed = fixed_variables(Limits(jnp.full(2, jnp.inf), one, one, jnp.zeros(()), fixed, one), 1, KNOTS)
+    is_fixed = fixed_variables(Limits(jnp.full(2, jnp.inf), one, one, jnp.zeros(()), fixed, one, no_rows), 1, KNOTS)
     equations = np.zeros((2 * INTERVALS, SIZE))
     for k in range(INTERVALS):
         equations[2 * k : 2 * k + 2, INPUTS[k]] += end_jacobian

@@ -25,8 +25,8 @@ def test_a_curved_step_starts_along_its_direction_and_keeps_fixed_torques(flip):
     direction = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), p)
     fixed = np.zeros((1, 6), bool)
     fixed[0, 0] = True
-    one = jnp.ones(())
-    limits = Limits(jnp.full(2, jnp.inf), one[None], one[None], 0 * one, jnp.asarray(fixed), jnp.ones(1))
+    one, no_rows = jnp.ones(()), jnp.zeros((1, 5, 0, 5))
+    limits = Limits(jnp.full(2, jnp.inf), one[None], one[None], 0 * one, jnp.asarray(fixed), jnp.ones(1), no_rows)
     _, tangent = jax.jvp(lambda fraction: retract(p, direction, fraction, phase_dynamics, limits), (0.0,), (1.0,))
     for got, want in zip(jax.tree.leaves(tangent), jax.tree.leaves(direction), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-9)

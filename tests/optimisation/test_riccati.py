@@ -27,10 +27,10 @@ def _problem(name, count, *, free):
     places = np.broadcast_to(np.linspace(0.0, 1.0, KNOTS), (count, KNOTS))
     state = np.stack([places, rng.uniform(0.5, 1.5, (count, KNOTS))], axis=2)
     p = Variables(*map(as_device_array, (rng.uniform(-0.5, 0.5, (count, KNOTS, 2)), state, np.zeros(count))))
-    one, fixed = np.ones(count), np.zeros((count, KNOTS), bool)
+    one, fixed, no_rows = np.ones(count), np.zeros((count, KNOTS), bool), np.zeros((count, KNOTS - 1, 0, 5))
     fixed[0, 0] = True
     limits = Limits(
-        *map(as_device_array, (np.full(2, 40.0), one / (2 if free else 1), one, np.asarray(0.2), fixed, one))
+        *map(as_device_array, (np.full(2, 40.0), one / (2 if free else 1), one, np.asarray(0.2), fixed, one, no_rows))
     )
     return linearise_jit(p, phase_dynamics, limits, IntegratorOptions()), rng
 

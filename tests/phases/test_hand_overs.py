@@ -10,7 +10,7 @@ from reference.unreduced import Model
 import wholearm_jax as wa
 from wholearm_jax.cli.output import note_hand_overs
 from wholearm_jax.core import Status
-from wholearm_jax.phases import STARTS, STOPS, find_hand_overs, one_sided_torques, possible_hand_overs
+from wholearm_jax.phases import STARTING, STOPPING, find_hand_overs, one_sided_torques, possible_hand_overs
 
 FINGER = {"length": 0.11, "inertia": 2e-3, "viscous": 0.02, "dry": 0.01, "torque_limit": 1.0}
 HAND = {f"finger{k}": FINGER | {"joint": [x, 0.0]} for k, x in ((1, 0.08), (2, -0.08))}
@@ -106,17 +106,17 @@ def linear_in_torque(z, contacts):
     return rows[0], rows[1:]
 
 
-@pytest.mark.parametrize("sign", [STARTS, STOPS], ids=["start", "arrival"])
+@pytest.mark.parametrize("sign", [STARTING, STOPPING], ids=["start", "arrival"])
 def test_the_best_by_the_planned_contact_that_serves_by_the_other(sliding, sign):
     """Torques of a grid serve where the un-reduced equations say so, and none of them does better."""
     _, traced, over = sliding
     both = [linear_in_torque(np.array(traced[0].end), contacts) for contacts in (VERTICES, SLIDE["contacts"])]
-    (_, planned), (ahead, other) = both if sign == STOPS else both[::-1]
+    (_, planned), (ahead, other) = both if sign == STOPPING else both[::-1]
     grid = np.linspace(-1.0, 1.0, 201)
     torques = np.stack([np.ones(grid.size**2), *(a.ravel() for a in np.meshgrid(grid, grid))])
 
     serves = (other @ torques).min(0) >= 0.5 * over.best_motion(sign).margin
-    if sign == STOPS:
+    if sign == STOPPING:
         serves &= -(ahead @ torques) / np.linalg.norm(ahead[1:]) >= 0.03
     np.testing.assert_array_equal((over.unplanned_rows(sign) @ torques).min(0) >= 0, serves)
     assert 0.01 < serves.mean() < 0.9

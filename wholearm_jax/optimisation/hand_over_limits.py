@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from wholearm_jax.model import Scene
 from wholearm_jax.optimisation.interval_samples import SLACKS_PER_SAMPLE
-from wholearm_jax.phases import STARTS, STOPS, HandOver, may_hand_over
+from wholearm_jax.phases import STARTING, STOPPING, HandOver, may_hand_over
 
 EARLY_OR_LATE = 0.01  # of a phase, that an object may come before or after its time
 ROWS_AT_ONE_TIME = SLACKS_PER_SAMPLE + 1
@@ -42,7 +42,7 @@ def hand_over_rows(
         of zeros where there is no limit.
     """
     result = np.zeros((phases, intervals, count, 5))
-    for over, sign, phase in ((begin, STARTS, 0), (end, STOPS, -1)):
+    for over, sign, phase in ((begin, STARTING, 0), (end, STOPPING, -1)):
         rows = np.zeros((0, 3)) if over is None else over.unplanned_rows(sign)
         for interval, x, at in _times(sign, intervals, count):
             constant, torque = rows[:, :1], rows[:, 1:]
@@ -55,8 +55,8 @@ def _times(sign: float, intervals: int, count: int) -> Iterator[tuple[int, float
 
     Between these times torques are linear: what holds at both ends of each interval's share holds within.
     """
-    span = (0.0, EARLY_OR_LATE) if sign == STARTS else (1 - EARLY_OR_LATE, 1.0)
-    first_row = count // 2 if intervals == 1 and sign == STOPS else 0  # a single interval has both ends
+    span = (0.0, EARLY_OR_LATE) if sign == STARTING else (1 - EARLY_OR_LATE, 1.0)
+    first_row = count // 2 if intervals == 1 and sign == STOPPING else 0  # a single interval has both ends
     for interval in range(intervals):
         low, high = np.clip(np.array(span) * intervals - interval, 0.0, 1.0)
         if high > low:

@@ -215,24 +215,7 @@ def optimise(
         solve = partial(optimise, **again, tolerance=tolerance, callback=callback, traced=traced)
         return shortest_plan(solve, scene, margin, traced)
 
-    # The pointwise bound covers speeds up to multiples of a path length a duration: take the shortest that a phase may
-    # choose; for the convex one, the longest.
-    shortest = scene
-    if durations is not None:
-        shortest = _with_durations(scene, max(durations[0], MIN_DURATION_FRACTION * durations[1]))
-    pointwise, longest = bounds(shortest, traced=traced), scene
-    if durations is not None:
-        longest = _with_durations(scene, durations[1])
-    motions = convex_bounds(longest, traced=traced)
-    hand_overs = find_hand_overs(scene, traced)
-    limits = PlanLimits(
-        pointwise,
-        limit_by_hand_overs(tighten_bounds(scene, pointwise, motions, traced), hand_overs, traced),
-        hand_overs,
-        margins_by_either_contact(hand_overs),
-        too_short_phases(longest, pointwise, motions, traced),
-    )
-
+    limits = _plan_limits(scene, durations, traced)
     refines = knots is None and rate_limit is None and optimiser is None
     most_knots = MOST_KNOTS if refines else first_knots
     rows = schedule_rows(len(scene.phases), first_knots), hand_over_row_count(scene, first_knots)
@@ -245,6 +228,27 @@ def optimise(
         if results[-1].result.status is Status.OK:
             return results[-1]
     return max(results, key=lambda plan: plan.result.margin)
+
+
+def _plan_limits(scene: Scene, durations: tuple[float, float] | None, traced: tuple[TracedPhase, ...]) -> PlanLimits:
+    """Bound what schedules reach in the scene's durations, or in any of a range."""
+    # The pointwise bound covers speeds up to multiples of a path length a duration: take the shortest that a phase may
+    # choose; for the convex one, the longest.
+    shortest = scene
+    if durations is not None:
+        shortest = _with_durations(scene, max(durations[0], MIN_DURATION_FRACTION * durations[1]))
+    pointwise, longest = bounds(shortest, traced=traced), scene
+    if durations is not None:
+        longest = _with_durations(scene, durations[1])
+    motions = convex_bounds(longest, traced=traced)
+    hand_overs = find_hand_overs(scene, traced)
+    return PlanLimits(
+        pointwise,
+        limit_by_hand_overs(tighten_bounds(scene, pointwise, motions, traced), hand_overs, traced),
+        hand_overs,
+        margins_by_either_contact(hand_overs),
+        too_short_phases(longest, pointwise, motions, traced),
+    )
 
 
 def _solve_plan(

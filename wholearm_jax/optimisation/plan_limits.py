@@ -15,7 +15,7 @@ from wholearm_jax.margin import MarginBound
 from wholearm_jax.model import Arrival, Scene
 from wholearm_jax.optimisation.best_motion import BestMotion, convex_bounds, shortest_motions
 from wholearm_jax.optimisation.quasistatic_plan import bounds
-from wholearm_jax.phases import STARTS, STOPS, HandOver, TracedPhase, find_hand_overs, starts_at_rest, trace
+from wholearm_jax.phases import STARTING, STOPPING, HandOver, TracedPhase, find_hand_overs, starts_at_rest, trace
 
 
 def certified_bounds(
@@ -90,7 +90,7 @@ def margins_by_either_contact(hand_overs: Sequence[HandOver | None]) -> Float[np
     left = np.full(len(hand_overs), np.inf)
     for k, over in enumerate(hand_overs):
         if over is not None and over.margin > 0:
-            for phase, sign in ((k - 1, STOPS), (k, STARTS)):
+            for phase, sign in ((k - 1, STOPPING), (k, STARTING)):
                 left[phase] = min(left[phase], over.planned_margin(sign))
     return left
 

@@ -18,8 +18,8 @@ from wholearm_jax.phases.contact_opening import IMPULSE_ROUNDING, MAX_OPENING, C
 from wholearm_jax.phases.gradients import check_gradient
 from wholearm_jax.phases.hand_over_torques import OneSidedTorque, one_sided_torques
 from wholearm_jax.phases.hand_overs import (
-    STARTS,
-    STOPS,
+    STARTING,
+    STOPPING,
     HandOver,
     find_hand_over,
     find_hand_overs,

@@ -37,7 +37,7 @@ from wholearm_jax.phases.phase_tracing import TracedPhase
 POINT_TOL = 1e-6  # distance of a tip from a vertex, in the object's radius, at which the two are one point
 LEAST_SURPLUS = 0.03  # of the torques that brake or move the object, over the limits, beyond those that only balance
 UNPLANNED_SHARE = 0.5  # of the best margin by either contact, with which torques press the one that is not planned
-STOPS, STARTS = -1.0, 1.0  # what torques do at a hand-over: signs of their surplus
+STOPPING, STARTING = -1.0, 1.0  # what torques do at a hand-over: signs of their surplus
 
 
 class OneContact(NamedTuple):
@@ -63,7 +63,7 @@ class HandOver(NamedTuple):
     @property
     def margin(self) -> float:
         """The smaller of the largest margins with which the object arrives and starts [N]; negative: it cannot."""
-        return min(self.best_motion(sign).margin for sign in (STOPS, STARTS))
+        return min(self.best_motion(sign).margin for sign in (STOPPING, STARTING))
 
     def best_hold(self) -> StaticMargin:
         """Compute the torque that holds the object by either contact with the largest margin.
@@ -109,17 +109,17 @@ class HandOver(NamedTuple):
         best, limit = self.best_motion(sign).margin, self.before.statics.torque_limit
         if not best > 0:
             return np.zeros((0, 3))
-        other = self.after if sign == STOPS else self.before
+        other = self.after if sign == STOPPING else self.before
         force = other.slack * np.append(1.0, limit) / self.before.statics.unit
         force[:, 0] -= UNPLANNED_SHARE * best / self.before.statics.unit
-        if sign == STARTS:
+        if sign == STARTING:
             return force
         return np.vstack([force, sign * other.surplus_row(limit) - [LEAST_SURPLUS, 0.0, 0.0]])
 
     def planned_margin(self, sign: float) -> float:
         """Compute the largest margin by the planned contact [N] of torques that respect `unplanned_rows`."""
         programme, limit = self._programme()
-        planned, rows = self.before if sign == STOPS else self.after, self.unplanned_rows(sign)
+        planned, rows = self.before if sign == STOPPING else self.after, self.unplanned_rows(sign)
         slack = planned.slack / self.before.statics.unit
         programme.at_least("forces", -slack[:, 0], torque=slack[:, 1:] * limit, level=-1.0)
         programme.at_least("unplanned", -rows[:, 0], torque=rows[:, 1:])
