@@ -17,6 +17,7 @@ from wholearm_jax.feedback.either_formation import UNSURE
 from wholearm_jax.feedback.path_table import path_terms, tabulate_path
 from wholearm_jax.model import rigid_body
 from wholearm_jax.phases import ends_at_stop
+from wholearm_jax.phases.phase_ends import rest_terms
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -159,6 +160,19 @@ def test_a_motion_that_is_slow_at_a_hand_over_has_the_rates_of_a_faster_one(shor
     checked = wa.check(of_other_friction(short_path.scene), controller=law)
     assert (checked.status == wa.Status.OK).all()
     done = execute(short_path.result, timestep=2e-4, controller=law)
+    assert done.ending.value == "ok"
+    assert done.position_error < 5e-4
+
+
+def test_an_object_that_nothing_holds_waits_for_a_law_that_begins_without_acceleration():
+    """Without friction the sign of rounding said that it moves backward, and no law was written."""
+    scene = wa.load(DATA / "frictionless_slide.toml")
+    schedule = wa.torque_schedule([0.0, 2.0], [[0.45, -0.45]] * 2)
+    law = feedback(scene, schedule, friction=0.0)
+    assert all(phase.margin > 3.0 for phase in law.phases)
+    first = rest_terms(wa.trace(scene)[0].dynamics, 0)[0]
+    assert abs(first.ahead @ np.append(1.0, law.phases[0].torque[0])) < 1e-9 * np.abs(first.ahead).max()
+    done = execute(wa.simulate(scene, schedule), timestep=2e-4, controller=law)
     assert done.ending.value == "ok"
     assert done.position_error < 5e-4
 

@@ -23,6 +23,7 @@ from wholearm_jax.simulation.path_ode import PathODE
 from wholearm_jax.simulation.replay import integrate_with_replay_adjoint, replay_steps
 
 MAX_ITERATIONS = 40
+REST_ROUNDING = 1e-9  # of the terms of an acceleration, up to which it counts as none: a law's torques are as exact
 
 
 class Rest(NamedTuple):
@@ -83,10 +84,15 @@ def rest_until_departure(
 
 
 def starts(limits, y, row) -> Float[Array, "2"]:
-    """Return the accelerations from rest, forward and backward: the object moves where one is positive."""
+    """Return the accelerations from rest, forward and backward, beyond rounding: one that is positive moves the object.
+
+    Without friction they are each other's negative, and where a law begins with no acceleration, the sign of rounding
+    would say whether the object moves backward.
+    """
     loop, terms = limits
     torque = torque_of(loop, row, y[0], y[2:])
-    return terms[:, 0] + fused_matmul(terms[:, 1:], torque)
+    size = jnp.abs(terms[:, 0]) + jnp.abs(terms[:, 1:]) @ jnp.abs(torque)
+    return terms[:, 0] + fused_matmul(terms[:, 1:], torque) - REST_ROUNDING * stop_gradient(size)
 
 
 def _rate(parameters, loop: PhaseLoop, row, y):
