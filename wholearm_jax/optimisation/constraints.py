@@ -62,9 +62,9 @@ def force_count(knots: int) -> int:
     return samples_per_part(knots - 1) * SLACKS_PER_SAMPLE
 
 
-def inequality_count(knots: int, hand_over: int = 0) -> int:
+def inequality_count(knots: int, hand_over_rows: int = 0) -> int:
     """Return the number of inequalities of a part: forces, torques, torque rates, speeds, durations, hand-overs."""
-    return force_count(knots) + 8 + 4 + SPEED_COEFFICIENTS + 2 + hand_over
+    return force_count(knots) + 8 + 4 + SPEED_COEFFICIENTS + 2 + hand_over_rows
 
 
 def evaluate_constraints(
