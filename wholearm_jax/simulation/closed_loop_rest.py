@@ -23,7 +23,7 @@ from wholearm_jax.simulation.path_ode import PathODE
 from wholearm_jax.simulation.replay import integrate_with_replay_adjoint, replay_steps
 
 MAX_ITERATIONS = 40
-REST_ROUNDING = 1e-9  # of the terms of an acceleration, up to which it counts as none: a law's torques are as exact
+LAW_ROUNDING = 1e-9  # of the terms of an acceleration, up to which it counts as none: a law's torques are as exact
 
 
 class Rest(NamedTuple):
@@ -92,7 +92,7 @@ def starts(limits, y, row) -> Float[Array, "2"]:
     loop, terms = limits
     torque = torque_of(loop, row, y[0], y[2:])
     size = jnp.abs(terms[:, 0]) + jnp.abs(terms[:, 1:]) @ jnp.abs(torque)
-    return terms[:, 0] + fused_matmul(terms[:, 1:], torque) - REST_ROUNDING * stop_gradient(size)
+    return terms[:, 0] + fused_matmul(terms[:, 1:], torque) - LAW_ROUNDING * stop_gradient(size)
 
 
 def _rate(parameters, loop: PhaseLoop, row, y):

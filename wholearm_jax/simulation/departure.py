@@ -14,13 +14,16 @@ from wholearm_jax.core import Status, fused_matmul
 from wholearm_jax.dynamics import PathDynamics, evaluate, locate_panel
 from wholearm_jax.model import PhaseSchedule, torque_at
 
+REST_ROUNDING = 1e-12  # of the terms of an acceleration, up to which it counts as none
+
 
 def first_departure(
     dynamics: PathDynamics, phase_schedule: PhaseSchedule, segment, s, phase_time
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """Find when an object at rest at `s` starts to move.
 
-    The accelerations at rest are linear in the torque, hence piecewise linear in time: their first signs are exact.
+    The accelerations at rest are linear in the torque, hence piecewise linear in time: their first signs are exact, but
+    for rounding, which would move an object that nothing holds and that torques balance.
 
     Returns:
         The phase time (1 if it stays), and a `Status`: `ok` (forward), `reversed`, `ambiguous` or `stuck` (it stays).
@@ -39,7 +42,8 @@ def first_departure(
 
     def first_positive(terms):
         """The time at which an acceleration, linear in `(1, tau1, tau2)`, first turns positive."""
-        value = terms[0] + fused_matmul(torque, terms[1:])
+        size = jnp.abs(terms[0]) + jnp.abs(torque) @ jnp.abs(terms[1:])
+        value = terms[0] + fused_matmul(torque, terms[1:]) - REST_ROUNDING * stop_gradient(size)
         rate = fused_matmul(phase_schedule.slope, terms[1:])
         root = begin - value / jnp.where(rate > 0, rate, 1.0)
         time = jnp.where(value > 0, begin, jnp.where((rate > 0) & (root < last_start), root, jnp.inf))
