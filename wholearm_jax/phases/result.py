@@ -24,7 +24,7 @@ OPENING_ADVICE = "press it harder there, or enter the phase more slowly"
 REFUSED_STARTS = (Status.LEFT_FORMATION, Status.OBSTACLE)  # statuses of a path that mean that it cannot begin
 REMEDY_START = "the path cannot begin there: correct the start's pose and angles, or choose other contacts or fingers"
 UNTIL_FRACTION = 0.05  # of a path that ends at an obstacle, which the advice leaves out
-MIN_REST = 1e-9  # share of a phase: an object that comes to rest at its end does so earlier or later by rounding
+MIN_REST = 1e-7  # share of a phase: an object that comes to rest at its end does so earlier or later by rounding
 
 
 @dataclass(frozen=True)
